@@ -1,0 +1,1 @@
+"""The emulated bench: one plant behind wire-level emulators of every instrument."""

@@ -1,0 +1,1 @@
+"""The application: scene and bench files, control loop, interlocks, recorder, replay, console, command line."""

@@ -1,0 +1,161 @@
+"""Scene files: one TOML file says what is tested and how.
+
+Keys carry their units; values leave this module in SI. What a scene does not name is neither opened nor computed.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
+from rig.errors import FileError
+from rig.validation import explain
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    """A table of a scene or bench file: unknown keys and wrong types are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class SubstrateSection(Section):
+    """``[substrate]``."""
+
+    shape: Literal["sphere", "flat"]
+    diameter_mm: Annotated[float, Field(ge=0.1, le=1e7)] | None = None
+
+    @model_validator(mode="after")
+    def _sphere_has_a_diameter(self) -> SubstrateSection:
+        if self.shape == "sphere" and self.diameter_mm is None:
+            raise ValueError("a sphere needs diameter_mm")
+        return self
+
+
+class GripperSection(Section):
+    """``[gripper]``."""
+
+    kind: Literal["rigid", "soft", "punch"] = "rigid"
+    radius_mm: Annotated[float, Field(gt=0, le=1e3)] = 8.0
+    effective_radius_mm: Annotated[float, Field(gt=0, le=1e3)] = 7.3
+    chamber_volume_ml: Annotated[float, Field(gt=0, le=1e9)] = 7.2
+
+    @model_validator(mode="after")
+    def _contact_fits_the_rim(self) -> GripperSection:
+        if self.effective_radius_mm > self.radius_mm:
+            raise ValueError(
+                f"effective_radius_mm = {self.effective_radius_mm:g} exceeds radius_mm = {self.radius_mm:g}; "
+                "the contact cannot be wider than the gripper"
+            )
+        return self
+
+
+class MembraneSection(Section):
+    """``[membrane]``."""
+
+    youngs_modulus_MPa: Annotated[float, Field(ge=1e-4, le=1e5)] = 2.0
+    thickness_um: Annotated[float, Field(ge=0.1, le=1e4)] = 200.0
+    work_of_adhesion_J_m2: Annotated[float, Field(ge=0, le=1e4)] = 4.0
+
+
+class GasSection(Section):
+    """``[gas]``: how the model reads P_0."""
+
+    anchor: Literal["free", "start", "vented"] = "free"
+    atmospheric_pressure_kPa: Annotated[float, Field(gt=0, le=200)] = 101.3
+
+
+class PullOffSection(Section):
+    """``[protocol]`` of a pull-off test. Without ``initial_pressure_kPa`` the chamber is vented: no pump, no sensor."""
+
+    name: Literal["pull_off"] = "pull_off"
+    initial_pressure_kPa: Annotated[float, Field(gt=-101.3, le=1000)] | None = None
+    pressure_tolerance_kPa: Annotated[float, Field(gt=0, le=10)] = 0.05
+    preload_N: Annotated[float, Field(gt=0, le=50)] = 0.5
+    approach_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 100.0
+    retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    preload_dwell_s: Annotated[float, Field(ge=0, le=86400)] = 30.0
+    tare_s: Annotated[float, Field(ge=0.2, le=600)] = 2.0
+    contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 10.0
+
+
+ProtocolSection = PullOffSection
+
+
+class Scene(Section):
+    """A whole scene file."""
+
+    title: str = "untitled"
+    substrate: SubstrateSection
+    gripper: GripperSection = GripperSection()
+    membrane: MembraneSection = MembraneSection()
+    gas: GasSection = GasSection()
+    protocol: ProtocolSection = PullOffSection()
+
+    @property
+    def uses_pressure(self) -> bool:
+        """Whether the scene needs the pump and the pressure sensor."""
+        return getattr(self.protocol, "initial_pressure_kPa", None) is not None
+
+    def parameters(self, pressure_kPa: float | None = None) -> Parameters:
+        """Return the model's parameters, SI; ``pressure_kPa`` replaces the scene's P_0.
+
+        A scene without pressure is vented to the room.
+        """
+        scene_pressure: float | None = getattr(self.protocol, "initial_pressure_kPa", None)
+        pressure = scene_pressure if pressure_kPa is None else pressure_kPa
+        diameter = self.substrate.diameter_mm
+        return Parameters(
+            substrate=Substrate(self.substrate.shape, None if diameter is None else diameter * 1e-3),
+            gripper=Gripper(
+                radius=self.gripper.radius_mm * 1e-3,
+                effective_radius=self.gripper.effective_radius_mm * 1e-3,
+                chamber_volume=self.gripper.chamber_volume_ml * 1e-6,
+            ),
+            membrane=Membrane(
+                youngs_modulus=self.membrane.youngs_modulus_MPa * 1e6,
+                thickness=self.membrane.thickness_um * 1e-6,
+                work_of_adhesion=self.membrane.work_of_adhesion_J_m2,
+            ),
+            gas=Gas(
+                initial_pressure=0.0 if pressure is None else pressure * 1e3,
+                atmospheric_pressure=self.gas.atmospheric_pressure_kPa * 1e3,
+                anchor=GasAnchor.VENTED if pressure is None else GasAnchor(self.gas.anchor),
+            ),
+        )
+
+
+def load_scene(path: Path) -> Scene:
+    """Read and check a scene file.
+
+    Raises
+    ------
+    FileError
+        Names the file, the key, the value and the allowed range.
+    """
+    return parse_scene(read_text(path, "scene"), str(path))
+
+
+def parse_scene(text: str, source: str) -> Scene:
+    """Check the text of a scene file; ``source`` names it in messages."""
+    try:
+        return Scene.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"scene {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
+    except ValidationError as error:
+        raise FileError(explain("scene", source, error, Scene)) from error
+
+
+def read_text(path: Path, what: str) -> str:
+    """Read a small UTF-8 text file, or raise ``FileError`` that says what to do."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise FileError(f"{what} {path}: no such file. Remedy: check the path; examples are in {what}s/.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"{what} {path}: cannot be read ({error}). Remedy: it must be a UTF-8 text file.") from error

@@ -1,0 +1,1 @@
+"""The steps of a test and the protocols built from them."""
