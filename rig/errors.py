@@ -19,12 +19,6 @@ class Interlock(RigError):
     exit_code = 3
 
 
-class SequenceFailed(RigError):
-    """A step could not reach its condition."""
-
-    exit_code = 4
-
-
 class Refused(RigError):
     """The scene cannot be run on this bench; nothing has moved."""
 

@@ -1,0 +1,299 @@
+"""The pull-off test of both papers: contact, preload, pressurize, retract, pull-off, detachment.
+
+EML 2020 Fig. 2c; speeds and preload from its section 2. Forces are counted from the tare, compression positive.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.interfaces import Pump, PumpState
+from sequences.errors import StepFailed
+from sequences.frame import Frame
+from sequences.step import Apparatus, Motion, Step, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class PullOffSettings:
+    """Settings in SI units; ``initial_pressure`` is ``None`` for a vented chamber."""
+
+    preload: float
+    approach_speed: float
+    retract_speed: float
+    dwell: float
+    tare: float
+    contact_force: float
+    initial_pressure: float | None
+    pressure_tolerance: float
+    chamber_volume: float
+    atmospheric_pressure: float
+    return_speed: float = 500e-6
+    longest_retraction: float = 12e-3
+    tail: float = 5.0
+    pump_seconds: float = 4.0
+
+
+class PullOff:
+    """One pull-off test. What a step finds, the later ones use."""
+
+    def __init__(self, apparatus: Apparatus, settings: PullOffSettings) -> None:
+        self._apparatus = apparatus
+        self._settings = settings
+        self._zero = 0.0
+        self._noise = 0.0
+        self._start_height = 0.0
+        self._contact_height = 0.0
+        self._least_force = 0.0
+
+    def steps(self) -> list[Step]:
+        """Return the steps this scene needs, in order."""
+        s = self._settings
+        steps = [
+            Step("tare", f"{s.tare:g} s without contact", self._tare),
+            Step("approach", f"force above {s.contact_force * 1e3:g} mN", self._approach),
+            Step("preload", f"force reaches {s.preload:g} N", self._preload),
+            Step("dwell", f"{s.dwell:g} s at rest", self._dwell),
+        ]
+        if s.initial_pressure is not None:
+            words = f"P_a = {s.initial_pressure / 1e3:+g} kPa within {s.pressure_tolerance / 1e3:g} kPa"
+            steps.append(Step("pressurize", words, self._pressurize))
+        return [
+            *steps,
+            Step("retract", "the tension has passed its peak", self._retract),
+            Step("pull-off", f"no force for {s.tail:g} s", self._pull_off),
+            Step("return", "back at the starting height", self._return),
+        ]
+
+    def _force(self, frame: Frame) -> float:
+        return float(frame.force.mean()) - self._zero
+
+    def _tare(self, frame: Frame) -> Steps:
+        self._start_height = frame.stage.position
+        blocks: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
+        begin = frame.stop
+        while frame.stop - begin < self._settings.tare * frame.rate:
+            frame = yield
+            blocks.append(frame.force)
+            self._apparatus.tell.progress((frame.stop - begin) / frame.rate, self._settings.tare, "s")
+        force = np.concatenate(blocks)
+        means = np.array([block.mean() for block in blocks])
+        self._zero, self._noise = float(force.mean()), float(means.std(ddof=1))
+        drift = abs(float(means[len(means) // 2 :].mean() - means[: len(means) // 2].mean()))
+        if max(drift, 3 * self._noise) > self._settings.contact_force:
+            raise StepFailed(
+                "tare",
+                f"the force is not at rest: noise {self._noise * 1e3:.2f} mN, change {drift * 1e3:.2f} mN, "
+                f"contact is at {self._settings.contact_force * 1e3:g} mN",
+                "let the load cell warm up, keep the gripper clear of the sample, or raise contact_force_mN",
+            )
+        self._apparatus.tell.note(f"tare {self._zero:+.5f} N, noise of a frame's mean {self._noise * 1e3:.3f} mN")
+        return frame
+
+    def _approach(self, frame: Frame) -> Steps:
+        lowest = self._apparatus.stage.travel[0]
+        motion = Motion(self._apparatus, lowest, self._settings.approach_speed)
+        try:
+            while abs(self._force(frame)) < self._settings.contact_force:
+                if motion.arrived(frame):
+                    raise StepFailed(
+                        "approach",
+                        f"no contact down to {lowest * 1e3:.3f} mm",
+                        "raise the sample, or lower minimum_mm of the stage if the path is clear",
+                    )
+                motion.extend(frame)
+                frame = yield
+                self._apparatus.tell.progress(self._force(frame), self._settings.contact_force, "N")
+        except BaseException:
+            self._apparatus.stage.stop()
+            raise
+        self._contact_height = frame.stage.position
+        self._apparatus.tell.note(f"contact at {self._contact_height * 1e3:.4f} mm")
+        return frame  # still moving: the preload takes over
+
+    def _preload(self, frame: Frame) -> Steps:
+        goal = self._settings.preload
+        motion = Motion(self._apparatus, self._apparatus.stage.travel[0], self._settings.approach_speed)
+        last = frame
+        try:
+            while self._force(frame) < goal:
+                if motion.arrived(frame):
+                    raise StepFailed(
+                        "preload",
+                        f"{self._force(frame):.3f} of {goal:g} N at the lowest height allowed",
+                        "raise the sample or lower minimum_mm of the stage",
+                    )
+                motion.change_speed(self._preload_speed(last, frame))
+                motion.extend(frame)
+                last = frame
+                frame = yield
+                self._apparatus.tell.progress(self._force(frame), goal, "N")
+        finally:
+            self._apparatus.stage.stop()
+        return frame
+
+    def _preload_speed(self, last: Frame, frame: Frame) -> float:
+        """Slow down as the force nears the preload: what is left should take at least a quarter of a second."""
+        travelled = last.stage.position - frame.stage.position
+        if travelled <= 0.05e-6:
+            return self._settings.approach_speed
+        stiffness = max((self._force(frame) - self._force(last)) / travelled, 1e-3)
+        left = self._settings.preload - self._force(frame)
+        return min(self._settings.approach_speed, max(left / stiffness / 0.25, 1e-6))
+
+    def _dwell(self, frame: Frame) -> Steps:
+        begin = frame.stop
+        while frame.stop - begin < self._settings.dwell * frame.rate:
+            frame = yield
+            self._apparatus.tell.progress((frame.stop - begin) / frame.rate, self._settings.dwell, "s")
+        return frame
+
+    def _pressurize(self, frame: Frame) -> Steps:
+        pump, goal = self._apparatus.pump, self._settings.initial_pressure
+        if pump is None or goal is None:  # the scene's check keeps this from happening
+            raise StepFailed("pressurize", "the bench has no pump", "add [pump] and [pressure] to the bench")
+        try:
+            volume = self._settings.chamber_volume
+            for _ in range(12):
+                frame = yield from _wait(frame, 1.0)
+                pressure, frame = yield from self._mean_pressure(frame, 0.5)
+                if abs(pressure - goal) <= 0.6 * self._settings.pressure_tolerance:
+                    self._apparatus.tell.note(f"P_0 reached: {pressure / 1e3:+.3f} kPa")
+                    return frame
+                displaced = volume * (goal - pressure) / (self._settings.atmospheric_pressure + goal)
+                frame = yield from self._dispense(pump, displaced, frame)
+        finally:
+            pump.stop()
+        raise StepFailed(
+            "pressurize",
+            f"P_a stays at {pressure / 1e3:+.3f} kPa, {goal / 1e3:+g} kPa wanted",
+            "look for a leak, check chamber_volume_ml and the syringe diameter",
+        )
+
+    def _dispense(self, pump: Pump, volume: float, frame: Frame) -> Steps:
+        slowest, fastest = pump.rate_limits
+        rate = min(max(abs(volume) / self._settings.pump_seconds, 2 * slowest), 0.9 * fastest)
+        before = frame.pump
+        pump.dispense(volume, rate)
+        deadline = frame.stop + int((3 * abs(volume) / rate + 5) * frame.rate)
+        while frame.pump is before or frame.pump is None or frame.pump.state in _RUNNING:
+            frame = yield
+            self._show_pressure(frame)
+            if frame.stop > deadline:
+                raise StepFailed("pressurize", "the pump did not reach its target volume", "look at the pump's screen")
+        if frame.pump.state in (PumpState.STALLED, PumpState.AT_LIMIT):
+            raise StepFailed(
+                "pressurize",
+                f"the pump is {frame.pump.state} after {frame.pump.volume * 1e6:.4f} ml",
+                "free the syringe, check its travel and the force setting, then run again",
+            )
+        return frame
+
+    def _mean_pressure(self, frame: Frame, seconds: float) -> Generator[None, Frame, tuple[float, Frame]]:
+        blocks: list[float] = []
+        begin = frame.stop
+        while frame.stop - begin < seconds * frame.rate:
+            frame = yield
+            if frame.pressure is not None:
+                blocks.append(float(frame.pressure.mean()))
+            self._show_pressure(frame)
+        return float(np.mean(blocks)), frame
+
+    def _show_pressure(self, frame: Frame) -> None:
+        if frame.pressure is not None:
+            self._apparatus.tell.progress(float(frame.pressure.mean()), self._settings.initial_pressure or 0.0, "Pa")
+
+    def _retract(self, frame: Frame) -> Steps:
+        motion = self._retraction(frame)
+        least = self._force(frame)
+        try:
+            while not self._peak_passed(self._force(frame), least):
+                frame = yield from self._on(motion, frame, "retract")
+                least = min(least, self._force(frame))
+                self._apparatus.tell.progress(self._force(frame), least, "N")
+                if self._never_adhered(frame, least):
+                    self._apparatus.tell.note("no adhesion: the force never became tensile")
+                    break
+        except BaseException:
+            self._apparatus.stage.stop()
+            raise
+        self._least_force = least
+        return frame
+
+    def _pull_off(self, frame: Frame) -> Steps:
+        motion = self._retraction(frame)
+        band = max(self._settings.contact_force / 2, 6 * self._noise, 0.04 * -self._least_force)
+        quiet = 0
+        recent: deque[float] = deque(maxlen=max(2, round(0.5 * frame.rate / frame.force.size)))
+        try:
+            while quiet < self._settings.tail * frame.rate:
+                frame = yield from self._on(motion, frame, "pull-off")
+                recent.append(self._force(frame))
+                free = max(recent) - min(recent) < band and abs(recent[-1]) < band
+                quiet = quiet + frame.force.size if free else 0
+                self._apparatus.tell.progress(quiet / frame.rate, self._settings.tail, "s")
+        finally:
+            self._apparatus.stage.stop()
+        self._apparatus.tell.note(f"detached below {frame.stage.position * 1e3:.4f} mm")
+        return frame
+
+    def _retraction(self, frame: Frame) -> Motion:
+        highest = self._apparatus.stage.travel[1]
+        target = min(self._contact_height + self._settings.longest_retraction, highest)
+        return Motion(self._apparatus, target, self._settings.retract_speed)
+
+    def _on(self, motion: Motion, frame: Frame, step: str) -> Steps:
+        """Go on retracting by one frame."""
+        if motion.arrived(frame):
+            raise StepFailed(
+                step,
+                f"still attached at {frame.stage.position * 1e3:.3f} mm, force {self._force(frame):+.4f} N",
+                "free the sample by hand; a longer way up needs a higher maximum_mm",
+            )
+        motion.extend(frame)
+        return (yield)
+
+    def _peak_passed(self, force: float, least: float) -> bool:
+        tension = -least
+        return tension > max(self._settings.contact_force, 6 * self._noise) and force > least + max(
+            0.1 * tension, 6 * self._noise
+        )
+
+    def _never_adhered(self, frame: Frame, least: float) -> bool:
+        clear = frame.stage.position > self._contact_height + 3e-3
+        return (
+            clear and least > -self._settings.contact_force and abs(self._force(frame)) < self._settings.contact_force
+        )
+
+    def _return(self, frame: Frame) -> Steps:
+        """Go up to the starting height; away from the sample the whole way is commanded at once."""
+        target = max(self._start_height, frame.stage.position)
+        self._apparatus.stage.set_speed(self._settings.return_speed)
+        self._apparatus.stage.move_to(target)
+        deadline = frame.stop + int(
+            (3 * (target - frame.stage.position) / self._settings.return_speed + 5) * frame.rate
+        )
+        try:
+            while abs(frame.stage.position - target) > 5e-6 or frame.stage.moving:
+                frame = yield
+                self._apparatus.tell.progress(frame.stage.position, target, "m")
+                if not frame.stage.moving and abs(frame.stage.position - target) > 5e-6:
+                    self._apparatus.stage.move_to(target)  # taken up again after a hold
+                if frame.stop > deadline:
+                    raise StepFailed("return", "the stage does not arrive", "check the path and the stage's servo")
+        finally:
+            self._apparatus.stage.stop()
+        return frame
+
+
+_RUNNING = (PumpState.INFUSING, PumpState.WITHDRAWING)
+
+
+def _wait(frame: Frame, seconds: float) -> Steps:
+    begin = frame.stop
+    while frame.stop - begin < seconds * frame.rate:
+        frame = yield
+    return frame

@@ -1,0 +1,123 @@
+"""What a step is, and how steps follow one another.
+
+A step is a generator: it commands the stage or the pump, then ``frame = yield`` until its condition holds; its
+``finally`` stops what it started. Time is counted in samples, never on the wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.interfaces import Pump, Stage
+from sequences.frame import Frame
+
+Steps = Generator[None, Frame, Frame]
+"""Receives frames; returns the last one it took."""
+
+
+class Teller(Protocol):
+    """Where steps report to."""
+
+    def started(self, name: str) -> None:
+        """A step has begun."""
+        ...
+
+    def progress(self, value: float, target: float, unit: str) -> None:
+        """How far the present step is from its condition (SI)."""
+        ...
+
+    def ended(self, name: str, outcome: str) -> None:
+        """A step has ended: ``done`` or what happened instead."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Something the log should hold."""
+        ...
+
+
+@dataclass(frozen=True)
+class Apparatus:
+    """What the steps act on.
+
+    Attributes
+    ----------
+    look_ahead
+        A move under way is never commanded further than this beyond the present position, m (dead man).
+    """
+
+    stage: Stage
+    pump: Pump | None
+    tell: Teller
+    look_ahead: float = 50e-6
+
+
+@dataclass(frozen=True)
+class Step:
+    """A named step, the condition that ends it in words, and what it does."""
+
+    name: str
+    condition: str
+    act: Callable[[Frame], Steps]
+
+
+def play(steps: Sequence[Step], tell: Teller) -> Generator[None, Frame, None]:
+    """Play the steps one after another; each gets the frame in which its predecessor ended."""
+    frame = yield
+    for step in steps:
+        tell.started(step.name)
+        outcome = "stopped"
+        try:
+            frame = yield from step.act(frame)
+            outcome = "done"
+        finally:
+            tell.ended(step.name, outcome)
+
+
+class Motion:
+    """A move commanded a short stretch at a time, so that the stage stops by itself if the program dies.
+
+    Call ``extend`` with every frame. After a hold the move is taken up again.
+    """
+
+    _RESOLUTION = 1e-6
+
+    def __init__(self, apparatus: Apparatus, target: float, speed: float) -> None:
+        self._apparatus = apparatus
+        self._target = target
+        self._commanded: float | None = None
+        self._speed = speed
+        apparatus.stage.set_speed(speed)
+
+    @property
+    def speed(self) -> float:
+        """Commanded speed, m/s."""
+        return self._speed
+
+    def change_speed(self, speed: float) -> None:
+        """Change the speed of the running move, m/s; differences below a tenth are not worth a command."""
+        if abs(speed - self._speed) > 0.1 * self._speed:
+            self._speed = speed
+            self._apparatus.stage.set_speed(speed)
+            self._commanded = None  # most controllers take a new speed with the next move
+
+    def extend(self, frame: Frame) -> None:
+        """Command the next stretch when half of the last one has been travelled."""
+        position, ahead = frame.stage.position, self._apparatus.look_ahead
+        stretch = max(min(self._target - position, ahead), -ahead)
+        if self._is_due(frame, position, ahead):
+            self._commanded = position + stretch
+            self._apparatus.stage.move_to(self._commanded)
+
+    def arrived(self, frame: Frame) -> bool:
+        """Whether the stage stands at the target."""
+        return not frame.stage.moving and abs(frame.stage.position - self._target) < 2 * self._RESOLUTION
+
+    def _is_due(self, frame: Frame, position: float, ahead: float) -> bool:
+        if self._commanded is None:
+            return True
+        left = abs(self._commanded - position)
+        if abs(self._commanded - self._target) < self._RESOLUTION:
+            return not frame.stage.moving and left > 2 * self._RESOLUTION
+        return left < ahead / 2 or not frame.stage.moving
