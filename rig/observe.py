@@ -88,7 +88,7 @@ class StepEvent:
 class Event:
     """One line of the log.
 
-    ``kind``: ``command`` (sent to an instrument), ``operator``, ``note``, ``warning``, ``fault``, ``interlock`` or ``end``.
+    ``kind``: ``command`` (to an instrument), ``operator``, ``note``, ``warning``, ``fault``, ``interlock`` or ``end``.
     """
 
     sample: int

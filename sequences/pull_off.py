@@ -5,6 +5,7 @@ EML 2020 Fig. 2c; speeds and preload from its section 2. Forces are counted from
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 from drivers.interfaces import Pump, PumpState
 from sequences.errors import StepFailed
 from sequences.frame import Frame
-from sequences.step import Apparatus, Motion, Step, Steps
+from sequences.step import Apparatus, Motion, Step, Steps, stopping_on_failure
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,7 @@ class PullOff:
     def _approach(self, frame: Frame) -> Steps:
         lowest = self._apparatus.stage.travel[0]
         motion = Motion(self._apparatus, lowest, self._settings.approach_speed)
-        try:
+        with stopping_on_failure(self._apparatus.stage):
             while abs(self._force(frame)) < self._settings.contact_force:
                 if motion.arrived(frame):
                     raise StepFailed(
@@ -107,9 +108,6 @@ class PullOff:
                 motion.extend(frame)
                 frame = yield
                 self._apparatus.tell.progress(self._force(frame), self._settings.contact_force, "N")
-        except BaseException:
-            self._apparatus.stage.stop()
-            raise
         self._contact_height = frame.stage.position
         self._apparatus.tell.note(f"contact at {self._contact_height * 1e3:.4f} mm")
         return frame  # still moving: the preload takes over
@@ -209,7 +207,7 @@ class PullOff:
     def _retract(self, frame: Frame) -> Steps:
         motion = self._retraction(frame)
         least = self._force(frame)
-        try:
+        with stopping_on_failure(self._apparatus.stage):
             while not self._peak_passed(self._force(frame), least):
                 frame = yield from self._on(motion, frame, "retract")
                 least = min(least, self._force(frame))
@@ -217,9 +215,6 @@ class PullOff:
                 if self._never_adhered(frame, least):
                     self._apparatus.tell.note("no adhesion: the force never became tensile")
                     break
-        except BaseException:
-            self._apparatus.stage.stop()
-            raise
         self._least_force = least
         return frame
 
@@ -271,17 +266,14 @@ class PullOff:
     def _return(self, frame: Frame) -> Steps:
         """Go up to the starting height; away from the sample the whole way is commanded at once."""
         target = max(self._start_height, frame.stage.position)
-        self._apparatus.stage.set_speed(self._settings.return_speed)
-        self._apparatus.stage.move_to(target)
-        deadline = frame.stop + int(
-            (3 * (target - frame.stage.position) / self._settings.return_speed + 5) * frame.rate
-        )
+        motion = Motion(self._apparatus, target, self._settings.return_speed, look_ahead=math.inf)
+        seconds = 3 * (target - frame.stage.position) / self._settings.return_speed + 5
+        deadline = frame.stop + round(seconds * frame.rate)
         try:
-            while abs(frame.stage.position - target) > 5e-6 or frame.stage.moving:
+            while not motion.arrived(frame):
+                motion.extend(frame)
                 frame = yield
                 self._apparatus.tell.progress(frame.stage.position, target, "m")
-                if not frame.stage.moving and abs(frame.stage.position - target) > 5e-6:
-                    self._apparatus.stage.move_to(target)  # taken up again after a hold
                 if frame.stop > deadline:
                     raise StepFailed("return", "the stage does not arrive", "check the path and the stage's servo")
         finally:

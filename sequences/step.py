@@ -6,7 +6,8 @@ A step is a generator: it commands the stage or the pump, then ``frame = yield``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -75,6 +76,16 @@ def play(steps: Sequence[Step], tell: Teller) -> Generator[None, Frame, None]:
             tell.ended(step.name, outcome)
 
 
+@contextmanager
+def stopping_on_failure(stage: Stage) -> Iterator[None]:
+    """Stop the stage if the step is left by an error or closed; a step that ends well hands its motion on."""
+    try:
+        yield
+    except BaseException:
+        stage.stop()
+        raise
+
+
 class Motion:
     """A move commanded a short stretch at a time, so that the stage stops by itself if the program dies.
 
@@ -83,8 +94,9 @@ class Motion:
 
     _RESOLUTION = 1e-6
 
-    def __init__(self, apparatus: Apparatus, target: float, speed: float) -> None:
+    def __init__(self, apparatus: Apparatus, target: float, speed: float, *, look_ahead: float | None = None) -> None:
         self._apparatus = apparatus
+        self._look_ahead = apparatus.look_ahead if look_ahead is None else look_ahead
         self._target = target
         self._commanded: float | None = None
         self._speed = speed
@@ -104,7 +116,7 @@ class Motion:
 
     def extend(self, frame: Frame) -> None:
         """Command the next stretch when half of the last one has been travelled."""
-        position, ahead = frame.stage.position, self._apparatus.look_ahead
+        position, ahead = frame.stage.position, self._look_ahead
         stretch = max(min(self._target - position, ahead), -ahead)
         if self._is_due(frame, position, ahead):
             self._commanded = position + stretch
