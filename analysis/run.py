@@ -36,7 +36,8 @@ class Sensors:
     position
         Standard uncertainty of the stage's position scale, relative.
     compliance, compliance_uncertainty
-        C of load cell, fixture and frame, m/N: true separation = stage travel - F C.
+        C of load cell, fixture and frame, m/N. A compressed load train lets the gripper stay behind the stage:
+        true separation = height + F C (height rises away from the sample, F is positive in compression).
     """
 
     force_gain: float = 0.0
@@ -72,6 +73,10 @@ class Run:
         The scene's parameters (nominal, as the overlay uses them), or ``None`` where the scene has no model.
     settings
         Scene values the analysis may need, e.g. ``preload_N``, ``indenter_radius_mm``; keys as in the scene file.
+    complete
+        Whether the sequence reached its end.
+    pump_volume
+        (n,), m^3, net volume the pump has displaced into the chamber, or ``None``.
     """
 
     name: str
@@ -85,6 +90,7 @@ class Run:
     sensors: Sensors = field(default_factory=Sensors)
     settings: Mapping[str, float | str] = field(default_factory=dict)
     complete: bool = True
+    pump_volume: Array | None = None
 
     @property
     def time(self) -> Array:
