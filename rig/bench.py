@@ -1,0 +1,169 @@
+"""Bench files: the instruments, how to reach each, their calibrations and limits."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from rig.errors import FileError
+from rig.scene import Section, read_text
+from rig.validation import explain
+
+EMULATED = "emulated"
+"""Connection of an instrument that the program emulates itself."""
+
+
+class StageSection(Section):
+    """``[stage]``: PI controller with a linear stage."""
+
+    connection: str
+    model: str = "C-863"
+    baud: Annotated[int, Field(ge=1200, le=921600)] = 115200
+    axis: str = "1"
+    inverted: bool = False
+    minimum_mm: float
+    maximum_mm: float
+    reference_on_start: bool = False
+    reply_timeout_ms: Annotated[float, Field(ge=20, le=5000)] = 400.0
+
+    @model_validator(mode="after")
+    def _has_travel(self) -> StageSection:
+        if self.minimum_mm >= self.maximum_mm:
+            raise ValueError(f"minimum_mm = {self.minimum_mm:g} must lie below maximum_mm = {self.maximum_mm:g}")
+        return self
+
+
+class PumpSection(Section):
+    """``[pump]``: KD Scientific Legato with the syringe that is in it."""
+
+    connection: str
+    model: str = "Legato"
+    baud: Annotated[int, Field(ge=1200, le=921600)] = 115200
+    address: Annotated[int, Field(ge=0, le=99)] = 0
+    syringe_diameter_mm: Annotated[float, Field(gt=0, le=50)]
+    syringe_volume_ml: Annotated[float, Field(gt=0, le=200)]
+    force_percent: Annotated[int, Field(ge=1, le=100)] = 50
+    reply_timeout_ms: Annotated[float, Field(ge=20, le=5000)] = 500.0
+    settle_ms: Annotated[float, Field(ge=0, le=5000)] = 200.0
+
+
+class DaqSection(Section):
+    """``[daq]``: NI device, through the local runtime or a gRPC server."""
+
+    connection: str = "local"
+    model: str | None = None
+    rate_Hz: Annotated[float, Field(ge=100, le=50_000)] = 1000.0
+    frame_ms: Annotated[float, Field(ge=1, le=1000)] = 20.0
+    allow_remote: bool = False
+
+
+class CalibrationSection(Section):
+    """A calibration record: one line, value = slope * reading + intercept, and where it comes from."""
+
+    id: str
+    certificate: str
+    date: str
+    operator: str
+    serial: str
+    slope: float
+    intercept: float = 0.0
+    relative_uncertainty: Annotated[float, Field(ge=0, le=1)]
+    residual: Annotated[float, Field(ge=0)]
+    temperature_C: float = 23.0
+
+
+class ForceSection(Section):
+    """``[force]``: load cell. ``calibration``: N per V (amplified) or N per mV/V (bridge)."""
+
+    channel: str
+    cell: str = "GSO-500"
+    capacity_N: Annotated[float, Field(gt=0, le=1000)]
+    readout: Literal["amplified", "bridge"] = "amplified"
+    range_V: Annotated[float, Field(gt=0, le=20)] = 10.0
+    terminal: Literal["default", "rse", "nrse", "diff"] = "default"
+    excitation_V: Annotated[float, Field(gt=0, le=10)] = 2.5
+    bridge_ohm: Annotated[float, Field(gt=0)] = 350.0
+    compression_positive: bool = True
+    compliance_um_per_N: Annotated[float, Field(ge=0)] = 0.0
+    compliance_uncertainty_um_per_N: Annotated[float, Field(ge=0)] = 0.0
+    calibration: CalibrationSection
+
+
+class PressureSection(Section):
+    """``[pressure]``: Honeywell HSC, ratiometric, its supply on a channel of its own."""
+
+    signal_channel: str
+    supply_channel: str
+    sensor: str = "HSCSANN600MDAA5"
+    terminal: Literal["default", "rse", "nrse", "diff"] = "default"
+    zero_offset_Pa: Annotated[float, Field(ge=-1200, le=1200)] = 0.0
+    calibration: CalibrationSection | None = None
+
+
+class LimitsSection(Section):
+    """``[limits]``: what ends a run. Untared values."""
+
+    compression_N: Annotated[float, Field(gt=0)]
+    tension_N: Annotated[float, Field(gt=0)]
+    pressure_low_kPa: Annotated[float, Field(ge=-101.3, le=0)] = -55.0
+    pressure_high_kPa: Annotated[float, Field(ge=0, le=1000)] = 55.0
+    look_ahead_um: Annotated[float, Field(gt=0, le=1000)] = 50.0
+    lag_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+
+
+class Bench(Section):
+    """A whole bench file. Pump and pressure are needed by scenes with pressure only."""
+
+    title: str = "untitled"
+    stage: StageSection
+    daq: DaqSection
+    force: ForceSection
+    limits: LimitsSection
+    pump: PumpSection | None = None
+    pressure: PressureSection | None = None
+
+    @model_validator(mode="after")
+    def _cell_is_protected(self) -> Bench:
+        for key in ("compression_N", "tension_N"):
+            limit = getattr(self.limits, key)
+            if limit > 1.2 * self.force.capacity_N:
+                raise ValueError(
+                    f"limits.{key} = {limit:g} is beyond the load cell: {self.force.cell} carries "
+                    f"{self.force.capacity_N:g} N, at most 120 % of it ({1.2 * self.force.capacity_N:.3g} N) is allowed"
+                )
+        return self
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether the program emulates the instruments itself."""
+        return self.stage.connection == EMULATED
+
+
+def load_bench(path: Path | None) -> tuple[Bench, str]:
+    """Read and check a bench file, or the emulated bench for ``None``; return it with its text.
+
+    Raises
+    ------
+    FileError
+        Names the file, the key, the value and the allowed range.
+    """
+    if path is None:
+        from importlib.resources import files
+
+        text, source = files("benches").joinpath("emulated.toml").read_text("utf-8"), "benches/emulated.toml"
+    else:
+        text, source = read_text(path, "bench"), str(path)
+    return parse_bench(text, source), text
+
+
+def parse_bench(text: str, source: str) -> Bench:
+    """Check the text of a bench file; ``source`` names it in messages."""
+    try:
+        return Bench.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"bench {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
+    except ValidationError as error:
+        raise FileError(explain("bench", source, error, Bench)) from error

@@ -1,0 +1,243 @@
+"""The control loop: the DAQ is its clock, one thread, no timers.
+
+read -> convert -> interlocks -> record -> observers -> sequence
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage
+from rig.errors import Interlock, StoppedByOperator
+from rig.interlocks import Interlocks
+from rig.observe import Controls, Event, Observer, StepEvent, StepPhase, Wish
+from rig.recorder import Recorder
+from rig.timebase import TimeBase
+from sequences.frame import Frame
+
+Array = NDArray[np.float64]
+Sequencer = Generator[None, Frame, None]
+
+PROGRESS_FRAMES = 5
+
+
+class Converter(Protocol):
+    """Volts to SI, and whether they can be believed."""
+
+    def convert(self, volts: Array) -> tuple[Array, Array | None]:
+        """Return force (N, untared, compression positive) and pressure (Pa gauge) or ``None``.
+
+        Raises
+        ------
+        SensorFault
+            The signal cannot be true.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """What a run has open. ``pump`` is ``None`` in a scene without pressure."""
+
+    stage: Stage
+    pump: Pump | None
+    daq: Daq
+    clock: Clock
+
+
+class Reporter:
+    """Carries steps, events and predictions to recorder and observers. A failing observer is dropped, loudly."""
+
+    def __init__(self, recorder: Recorder | None, observers: Iterable[Observer]) -> None:
+        self._recorder = recorder
+        self._observers = list(observers)
+        self._step = ""
+        self._frames = 0
+        self.sample = 0
+
+    @property
+    def step(self) -> str:
+        """Name of the step under way."""
+        return self._step
+
+    def started(self, name: str) -> None:
+        """A step has begun."""
+        self._step, self._frames = name, 0
+        self._tell(StepEvent(StepPhase.STARTED, name, self.sample))
+
+    def progress(self, value: float, target: float, unit: str) -> None:
+        """The step gets on; observers hear of it a few times a second."""
+        self._frames += 1
+        if self._frames % PROGRESS_FRAMES == 1:
+            self._tell(StepEvent(StepPhase.PROGRESS, self._step, self.sample, "", value, target, unit))
+
+    def ended(self, name: str, outcome: str) -> None:
+        """A step has ended."""
+        self._tell(StepEvent(StepPhase.ENDED, name, self.sample, outcome))
+
+    def note(self, text: str) -> None:
+        """A line of the sequence."""
+        self.event("note", text)
+
+    def event(self, kind: str, text: str) -> None:
+        """A line for the log."""
+        event = Event(self.sample, kind, text)
+        if self._recorder is not None:
+            self._recorder.event(event)
+        self.notify("event", event)
+
+    def prediction(self, prediction: Any, text: str) -> None:
+        """A live prediction, and its form in the recording."""
+        if self._recorder is not None:
+            self._recorder.prediction(self.sample, text)
+        self.notify("prediction", prediction)
+
+    def notify(self, what: str, subject: Any) -> None:
+        """Tell every observer; one that raises hears nothing more, and the log says so."""
+        for observer in tuple(self._observers):
+            try:
+                getattr(observer, what)(subject)
+            except Exception as error:  # noqa: BLE001 - an observer must not stop the loop
+                self._observers.remove(observer)
+                self.event("warning", f"observer {type(observer).__name__} failed and was dropped: {error!r}")
+
+    def _tell(self, event: StepEvent) -> None:
+        if self._recorder is not None:
+            self._recorder.step(event)
+        self.notify("step", event)
+
+
+class Loop:
+    """One run of one sequence.
+
+    Parameters
+    ----------
+    frame_samples
+        Samples in a frame.
+    pump_frames
+        The pump is polled once in so many frames.
+    """
+
+    def __init__(
+        self,
+        instruments: Instruments,
+        converter: Converter,
+        interlocks: Interlocks,
+        recorder: Recorder | None,
+        reporter: Reporter,
+        controls: Controls,
+        *,
+        frame_samples: int,
+        pump_frames: int = 5,
+    ) -> None:
+        self._instruments = instruments
+        self._converter = converter
+        self._interlocks = interlocks
+        self._recorder = recorder
+        self._reporter = reporter
+        self._controls = controls
+        self._frame_samples = frame_samples
+        self._pump_frames = pump_frames
+        self._stage_status: StageStatus
+        self._pump_status: PumpStatus | None = None
+        self._holding = False
+        self.samples = 0
+        self.interlock_latency: float | None = None
+
+    def run(self, sequence: Sequencer) -> None:
+        """Run until the sequence ends. Leaves the instruments as they are: the caller makes them safe.
+
+        Raises
+        ------
+        Interlock
+            A limit was passed.
+        DeviceError
+            An instrument failed.
+        StepFailed
+            A step could not reach its condition.
+        StoppedByOperator
+            The operator ended the run.
+        """
+        next(sequence)
+        try:
+            for frame in self._frames():
+                self._reporter.notify("frame", frame)
+                self._obey(self._controls.take())
+                if not self._holding:
+                    sequence.send(frame)
+        except StopIteration:
+            return
+        finally:
+            sequence.close()
+
+    def _frames(self) -> Generator[Frame, None, None]:
+        stage, daq, clock = self._instruments.stage, self._instruments.daq, self._instruments.clock
+        self._stage_status = stage.status()
+        daq.start()
+        timebase = TimeBase(daq.rate, self._stage_status)
+        number = 0
+        while True:
+            volts = daq.read(self._frame_samples)
+            arrived = clock()
+            force, pressure = self._checked(volts)
+            status = stage.status()
+            frame = Frame(number, self.samples, daq.rate, volts, force, pressure, status, self._poll_pump(number))
+            self._take(frame, timebase, arrived)
+            yield frame
+            number += 1
+
+    def _checked(self, volts: Array) -> tuple[Array, Array | None]:
+        """Convert and check before anything slower is done; a passed limit stops the stage here."""
+        began = time.perf_counter()
+        force, pressure = self._converter.convert(volts)
+        try:
+            self._interlocks.check_signals(force, pressure)
+        except Interlock as error:
+            self._instruments.stage.emergency_stop()
+            self.interlock_latency = time.perf_counter() - began
+            self._keep_last(volts, force, pressure)
+            raise error from None
+        return force, pressure
+
+    def _keep_last(self, volts: Array, force: Array, pressure: Array | None) -> None:
+        """Record the frame that passed the limit; the stage was polled last for the frame before."""
+        status = self._stage_status
+        frame = Frame(-1, self.samples, self._instruments.daq.rate, volts, force, pressure, status, self._pump_status)
+        self._record(frame, np.full(force.size, status.position), self._instruments.clock())
+        self._reporter.notify("frame", frame)
+
+    def _take(self, frame: Frame, timebase: TimeBase, arrived: float) -> None:
+        height = timebase.place(frame.start, frame.force.size, arrived, frame.stage)
+        self._record(frame, height, arrived)
+        self._interlocks.check_motion(frame.stage, timebase.lag(frame.stop, arrived))
+
+    def _record(self, frame: Frame, height: Array, arrived: float) -> None:
+        if self._recorder is not None:
+            self._recorder.append(frame, height, arrived)
+        self.samples = self._reporter.sample = frame.stop
+
+    def _poll_pump(self, number: int) -> PumpStatus | None:
+        pump = self._instruments.pump
+        if pump is not None and number % self._pump_frames == 0:
+            self._pump_status = pump.status()
+        return self._pump_status
+
+    def _obey(self, wish: Wish) -> None:
+        if wish is Wish.NONE:
+            return
+        self._reporter.event("operator", wish.value)
+        if wish is Wish.HOLD and not self._holding:
+            self._holding = True
+            self._instruments.stage.stop()
+            if self._instruments.pump is not None:
+                self._instruments.pump.stop()
+        elif wish is Wish.RESUME:
+            self._holding = False
+        elif wish in (Wish.STOP, Wish.EMERGENCY):
+            raise StoppedByOperator(f"{wish.value} by the operator in step {self._reporter.step}")

@@ -1,0 +1,251 @@
+"""The recorder: one HDF5 file per run, NeXus-shaped, in SWMR mode, flushed while the run goes on.
+
+Every dataset exists before SWMR starts. What ``flush`` has written is acknowledged: it survives the death of the
+program. Layout: ``docs/recording.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import PumpState, PumpStatus, StageStatus
+from rig.errors import FileError
+from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase
+from sequences.frame import Frame
+
+FORMAT = "membrane-adhesion-rig recording 1"
+FLUSH_SECONDS = 0.05
+
+FRAMES = np.dtype([("start", "<i8"), ("samples", "<i4"), ("arrived_s", "<f8")])
+STAGE = np.dtype(
+    [("sent_s", "<f8"), ("received_s", "<f8"), ("position_m", "<f8"), ("flags", "u1"), ("error", "<i4")],
+)
+PUMP = np.dtype(
+    [
+        ("sample", "<i8"),
+        ("sent_s", "<f8"),
+        ("received_s", "<f8"),
+        ("state", "u1"),
+        ("rate_m3_s", "<f8"),
+        ("volume_m3", "<f8"),
+    ]
+)
+STEPS = np.dtype([("sample", "<i8"), ("phase", "S8"), ("name", "S24"), ("outcome", "S200")])
+EVENTS = np.dtype([("sample", "<i8"), ("kind", "S12"), ("text", "S400")])
+PREDICTIONS = np.dtype([("sample", "<i8"), ("json", "S16000")])
+ENDING = np.dtype([("reason", "S400"), ("exit_code", "<i4"), ("samples", "<i8"), ("ended", "S40")])
+
+_STAGE_FLAGS = ("moving", "on_target", "servo_on", "negative_limit", "positive_limit")
+_PUMP_STATES = tuple(PumpState)
+
+
+def pack_stage(status: StageStatus) -> tuple[float, float, float, int, int]:
+    """Return one row of the stage's table."""
+    flags = sum(getattr(status, name) << bit for bit, name in enumerate(_STAGE_FLAGS))
+    return status.sent, status.received, status.position, flags, status.error
+
+
+def unpack_stage(row: Any) -> StageStatus:
+    """Return the poll a row of the stage's table holds."""
+    flags = {name: bool(row["flags"] >> bit & 1) for bit, name in enumerate(_STAGE_FLAGS)}
+    return StageStatus(
+        float(row["sent_s"]), float(row["received_s"]), float(row["position_m"]), error=int(row["error"]), **flags
+    )
+
+
+def unpack_pump(row: Any) -> PumpStatus:
+    """Return the poll a row of the pump's table holds."""
+    state = _PUMP_STATES[int(row["state"])]
+    return PumpStatus(
+        float(row["sent_s"]), float(row["received_s"]), state, float(row["rate_m3_s"]), float(row["volume_m3"])
+    )
+
+
+class Recorder:
+    """Writes one recording.
+
+    Parameters
+    ----------
+    path
+        Must not exist: a recording is never overwritten.
+    channels
+        Names of the raw channels, in order.
+    metadata
+        Texts kept whole beside the data: scene, bench, calibrations, versions, seed, ...
+
+    Raises
+    ------
+    FileError
+        The file exists or cannot be created.
+    """
+
+    def __init__(
+        self, path: Path, info: RunInfo, channels: tuple[str, ...], metadata: Mapping[str, str], units: str = "V"
+    ) -> None:
+        self.path = path
+        self.acknowledged = 0
+        self._pending: dict[str, list[Any]] = {}
+        self._last_flush = time.perf_counter()
+        self._last_pump: PumpStatus | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = h5py.File(path, "x", libver="latest")
+        except (OSError, ValueError) as error:
+            remedy = "choose another name with --out" if path.exists() else "check the folder, its rights and its space"
+            raise FileError(f"recording {path}: cannot be created ({error}). Remedy: {remedy}.") from error
+        self._sets = self._layout(info, channels, metadata, units)
+        self._file.flush()
+        self._file.swmr_mode = True
+
+    def _layout(
+        self, info: RunInfo, channels: tuple[str, ...], metadata: Mapping[str, str], units: str
+    ) -> dict[str, h5py.Dataset]:
+        file = self._file
+        file.attrs.update({"default": "entry", "format": FORMAT})
+        entry = _group(file, "entry", "NXentry", default="data")
+        entry.attrs["title"] = info.title
+        entry["title"] = info.title
+        entry["start_time"] = datetime.now(UTC).isoformat()
+        entry["definition"] = FORMAT
+        notes = _group(entry, "configuration", "NXcollection")
+        for name, text in metadata.items():
+            notes[name] = text
+        notes["run"] = json.dumps(asdict(info))
+        raw = _group(entry, "raw", "NXcollection")
+        raw.attrs["sample_rate_Hz"] = info.rate
+        data = _group(entry, "data", "NXdata", signal="force", axes="time")
+        sets = {
+            "volts": _rows(raw, "volts", np.float64, (len(channels),), 4096, units=units),
+            "frames": _rows(raw, "frames", FRAMES, (), 512),
+            "stage": _rows(raw, "stage", STAGE, (), 512),
+            "time": _rows(data, "time", np.float64, (), 4096, units="s"),
+            "force": _rows(data, "force", np.float64, (), 4096, units="N", long_name="F_r (N), untared"),
+            "height": _rows(data, "height", np.float64, (), 4096, units="m"),
+            "steps": _rows(entry, "steps", STEPS, (), 64),
+            "events": _rows(entry, "events", EVENTS, (), 64),
+            "predictions": _rows(entry, "predictions", PREDICTIONS, (), 8),
+            "ending": _rows(entry, "ending", ENDING, (), 1),
+        }
+        sets["volts"].attrs["channels"] = list(channels)
+        auxiliary = ["height"]
+        if info.uses_pressure:
+            sets["pressure"] = _rows(data, "pressure", np.float64, (), 4096, units="Pa", long_name="P_a (Pa), gauge")
+            sets["pump"] = _rows(raw, "pump", PUMP, (), 512)
+            auxiliary.append("pressure")
+        data.attrs["auxiliary_signals"] = auxiliary
+        return sets
+
+    def append(self, frame: Frame, height: NDArray[np.float64], arrived: float) -> None:
+        """Take one frame; it is acknowledged with the next flush."""
+        count = frame.force.size
+        self._put("volts", frame.volts.T)
+        self._put("frames", np.array([(frame.start, count, arrived)], FRAMES))
+        self._put("stage", np.array([pack_stage(frame.stage)], STAGE))
+        self._put("time", np.arange(frame.start, frame.stop) / frame.rate)
+        self._put("force", frame.force)
+        self._put("height", height)
+        if frame.pressure is not None:
+            self._put("pressure", frame.pressure)
+        if frame.pump is not None and frame.pump is not self._last_pump:
+            self._last_pump, pump = frame.pump, frame.pump
+            state = _PUMP_STATES.index(pump.state)
+            self._put("pump", np.array([(frame.stop, pump.sent, pump.received, state, pump.rate, pump.volume)], PUMP))
+        if time.perf_counter() - self._last_flush >= FLUSH_SECONDS:
+            self.flush()
+
+    def step(self, event: StepEvent) -> None:
+        """Take the beginning or the end of a step."""
+        if event.phase is not StepPhase.PROGRESS:
+            self._put("steps", _row(STEPS, event.sample, event.phase.value, event.name, event.outcome))
+
+    def event(self, event: Event) -> None:
+        """Take one line of the log."""
+        self._put("events", _row(EVENTS, event.sample, event.kind, event.text))
+
+    def prediction(self, sample: int, text: str) -> None:
+        """Take one live prediction as JSON."""
+        encoded = text.encode()
+        if len(encoded) > PREDICTIONS["json"].itemsize:
+            raise ValueError(f"a live prediction of {len(encoded)} bytes does not fit the recording")
+        self._put("predictions", np.array([(sample, encoded)], PREDICTIONS))
+
+    def end(self, ending: Ending) -> None:
+        """Take how the run ended."""
+        now = datetime.now(UTC).isoformat()
+        self._put("ending", _row(ENDING, ending.reason, ending.exit_code, ending.samples, now))
+
+    @property
+    def age(self) -> float:
+        """Seconds since the last flush."""
+        return time.perf_counter() - self._last_flush
+
+    def flush(self) -> None:
+        """Write what is pending, hand it to the operating system, and acknowledge it.
+
+        Raises
+        ------
+        FileError
+            The disk is full or gone; what was acknowledged before stays readable.
+        """
+        try:
+            for name, blocks in self._pending.items():
+                _extend(self._sets[name], blocks)
+        except (OSError, RuntimeError) as error:
+            raise FileError(
+                f"recording {self.path}: writing failed after {self.acknowledged} samples ({error}). "
+                "Remedy: free space on the disk; what was written stays readable."
+            ) from error
+        self.acknowledged += sum(len(block) for block in self._pending.get("force", ()))
+        self._pending.clear()
+        self._last_flush = time.perf_counter()
+
+    def close(self) -> None:
+        """Flush and close; a closed recorder closes again without effect."""
+        if not self._file:
+            return
+        try:
+            self.flush()
+        finally:
+            self._file.close()
+
+    def _put(self, name: str, block: NDArray[Any]) -> None:
+        self._pending.setdefault(name, []).append(block)
+
+
+def _row(table: np.dtype[Any], *values: Any) -> NDArray[Any]:
+    cells = tuple(value.encode() if isinstance(value, str) else value for value in values)
+    return np.array([cells], table)
+
+
+def _group(parent: h5py.Group, name: str, kind: str, **attributes: str) -> h5py.Group:
+    group = parent.create_group(name)
+    group.attrs.update({"NX_class": kind, **attributes})
+    return group
+
+
+def _rows(
+    parent: h5py.Group, name: str, kind: Any, shape: tuple[int, ...], chunk: int, **attributes: str
+) -> h5py.Dataset:
+    dataset = parent.create_dataset(
+        name, shape=(0, *shape), maxshape=(None, *shape), dtype=kind, chunks=(chunk, *shape), track_times=False
+    )
+    dataset.attrs.update(attributes)
+    return dataset
+
+
+def _extend(dataset: h5py.Dataset, blocks: list[NDArray[Any]]) -> None:
+    block = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+    size = dataset.shape[0]
+    dataset.resize(size + len(block), axis=0)
+    dataset[size:] = block
+    dataset.flush()
