@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage
+from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage, StageStatus
 from rig.errors import Interlock, StoppedByOperator
 from rig.interlocks import Interlocks
 from rig.observe import Controls, Event, Observer, StepEvent, StepPhase, Wish

@@ -1,0 +1,310 @@
+"""Recordings as they lie on disk: opening, repairing, and turning them into what the analysis and the replay need."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.run import Run, Sensors, Step
+from rig.bench import Bench, parse_bench
+from rig.errors import FileError
+from rig.observe import StepPhase
+from rig.recorder import ENDING, FORMAT
+from rig.scene import Scene, parse_scene
+
+_PER_SAMPLE = ("raw/volts", "data/time", "data/force", "data/height", "data/pressure")
+_PER_FRAME = ("raw/frames", "raw/stage")
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What ``recover`` found: samples and frames kept, and whether anything had to be done."""
+
+    path: Path
+    samples: int
+    frames: int
+    repaired: bool
+
+
+@contextmanager
+def open_recording(path: Path) -> Iterator[h5py.Group]:
+    """Open the entry of a recording for reading; one left by a crash is repaired first.
+
+    A recording that is still being written is opened as it stands.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged beyond repair, or no recording of this rig.
+    """
+    if not path.is_file():
+        raise FileError(f"recording {path}: no such file. Remedy: check the path.")
+    if _is_marked_open(path) and not _writer_lives(path):
+        recover(path)
+    with _opened(path, swmr=_is_marked_open(path)) as file:
+        yield _entry(file, path)
+
+
+def recover(path: Path, *, force: bool = False) -> Recovery:
+    """Repair a recording left by a crash, so that a plain ``h5py.File(path)`` opens it.
+
+    The readable content is copied into a new file, which then takes the old one's place; streams that one flush had
+    reached and another not are cut to the last complete frame.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read at all, or the program that writes it is still running (``force`` overrides).
+    """
+    if not path.is_file():
+        raise FileError(f"recording {path}: no such file. Remedy: check the path.")
+    marked = _is_marked_open(path)
+    if marked and not force and _writer_lives(path):
+        raise FileError(f"recording {path}: is still being written. Remedy: wait for the run to end.")
+    fresh = path.with_name(f".{path.name}.recovering")
+    with _opened(path, swmr=marked) as file:
+        entry = _entry(file, path)
+        samples, frames = _complete(entry)
+        if not marked:
+            return Recovery(path, samples, frames, repaired=False)
+        try:
+            _copy(file, fresh, samples, frames)
+        except (OSError, RuntimeError, KeyError) as error:
+            fresh.unlink(missing_ok=True)
+            raise FileError(
+                f"recording {path}: cannot be repaired ({error}). It is left as it was. Remedy: free space beside it "
+                "and try again; keep a copy of the file."
+            ) from error
+    os.replace(fresh, path)
+    return Recovery(path, samples, frames, repaired=True)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording in memory: raw streams and configuration, as the replay needs them."""
+
+    path: Path
+    scene: Scene
+    bench: Bench
+    configuration: dict[str, str]
+    info: dict[str, Any]
+    rate: float
+    channels: tuple[str, ...]
+    volts: NDArray[np.float64]
+    frames: NDArray[Any]
+    stage: NDArray[Any]
+    pump: NDArray[Any] | None
+    force: NDArray[np.float64]
+    pressure: NDArray[np.float64] | None
+    height: NDArray[np.float64]
+    steps: NDArray[Any]
+    events: NDArray[Any]
+    predictions: NDArray[Any]
+    ending: tuple[str, int] | None
+
+    def step_table(self) -> tuple[Step, ...]:
+        """Return the steps as sample ranges; a step the recording does not see the end of lasts to its last sample."""
+        steps: list[Step] = []
+        begun: tuple[str, int] | None = None
+        for row in self.steps:
+            name, sample = row["name"].decode(), int(row["sample"])
+            if row["phase"].decode() == StepPhase.STARTED:
+                begun = (name, sample)
+            elif begun is not None:
+                steps.append(Step(name, begun[1], sample, row["outcome"].decode(errors="ignore")))
+                begun = None
+        if begun is not None:
+            steps.append(Step(begun[0], begun[1], self.force.size, "stopped"))
+        return tuple(steps)
+
+
+def load_recording(path: Path) -> Recording:
+    """Read a whole recording.
+
+    Raises
+    ------
+    FileError
+        As ``open_recording``; or a part is missing or does not fit the others.
+    """
+    with open_recording(path) as entry:
+        try:
+            return _read(entry, path)
+        except (KeyError, ValueError, OSError, RuntimeError, TypeError, UnicodeDecodeError) as error:
+            raise FileError(
+                f"recording {path}: incomplete or damaged ({error}). Remedy: try `rig recover`; "
+                "otherwise open it with h5py and save what is there."
+            ) from error
+
+
+def load_run(path: Path) -> Run:
+    """Read a recording as the analysis sees it."""
+    recording = load_recording(path)
+    return as_run(recording)
+
+
+def as_run(recording: Recording) -> Run:
+    """Return the recording's arrays, steps and sensors for the analysis."""
+    scene, bench = recording.scene, recording.bench
+    return Run(
+        name=recording.path.stem,
+        protocol=scene.protocol.name,
+        rate=recording.rate,
+        force=recording.force,
+        pressure=recording.pressure,
+        height=recording.height,
+        steps=recording.step_table(),
+        parameters=scene.parameters(),
+        sensors=sensors(bench),
+        settings={
+            key: value
+            for key, value in scene.protocol.model_dump().items()
+            if isinstance(value, int | float | str) and not isinstance(value, bool)
+        },
+        complete=recording.ending is not None and recording.ending[1] == 0,
+    )
+
+
+def sensors(bench: Bench) -> Sensors:
+    """Return the standard uncertainties of a bench's calibration chain.
+
+    The Honeywell HSC states 0.25 % of its 1200 mbar span for accuracy and 1 % as the total error band (HSC series
+    data sheet); both are read as the half-width of a rectangular distribution.
+    """
+    rectangular = 3**-0.5
+    calibration = bench.force.calibration
+    pressure = bench.pressure.calibration if bench.pressure else None
+    return Sensors(
+        force_gain=calibration.relative_uncertainty,
+        force_linearity=calibration.residual,
+        pressure_gain=pressure.relative_uncertainty if pressure else 0.0025 * rectangular,
+        pressure_offset=pressure.residual if pressure else 300.0 * rectangular,
+        position=1e-5,
+        compliance=bench.force.compliance_um_per_N * 1e-6,
+        compliance_uncertainty=bench.force.compliance_uncertainty_um_per_N * 1e-6,
+    )
+
+
+def _read(entry: h5py.Group, path: Path) -> Recording:
+    samples, frames = _complete(entry)
+    configuration = {name: item.asstr()[()] for name, item in entry["configuration"].items()}
+    volts = entry["raw/volts"]
+    pressure = entry["data"].get("pressure")
+    pump = entry["raw"].get("pump")
+    ending = entry["ending"][:]
+    return Recording(
+        path=path,
+        scene=parse_scene(configuration["scene"], f"{path}:scene"),
+        bench=parse_bench(configuration["bench"], f"{path}:bench"),
+        configuration=configuration,
+        info=json.loads(configuration["run"]),
+        rate=float(entry["raw"].attrs["sample_rate_Hz"]),
+        channels=tuple(str(name) for name in volts.attrs["channels"]),
+        volts=np.ascontiguousarray(volts[:samples].T),
+        frames=entry["raw/frames"][:frames],
+        stage=entry["raw/stage"][:frames],
+        pump=None if pump is None else pump[:],
+        force=entry["data/force"][:samples],
+        pressure=None if pressure is None else pressure[:samples],
+        height=entry["data/height"][:samples],
+        steps=entry["steps"][:],
+        events=entry["events"][:],
+        predictions=entry["predictions"][:],
+        ending=None if not len(ending) else (ending[0]["reason"].decode(errors="ignore"), int(ending[0]["exit_code"])),
+    )
+
+
+def _complete(entry: h5py.Group) -> tuple[int, int]:
+    """Return samples and frames up to the last frame that every stream holds whole."""
+    limit = min(entry[name].shape[0] for name in _PER_SAMPLE if name in entry)
+    frames = entry["raw/frames"][: min(entry[name].shape[0] for name in _PER_FRAME)]
+    stops = frames["start"] + frames["samples"]
+    whole = int(np.searchsorted(stops, limit, side="right"))
+    return (int(stops[whole - 1]) if whole else 0), whole
+
+
+@contextmanager
+def _opened(path: Path, *, swmr: bool) -> Iterator[h5py.File]:
+    try:
+        file = h5py.File(path, "r", libver="latest", swmr=swmr)
+    except (OSError, RuntimeError) as error:
+        raise FileError(
+            f"recording {path}: not a readable HDF5 file ({error}). Remedy: check that it is the recording and whole."
+        ) from error
+    with file:
+        yield file
+
+
+def _entry(file: h5py.File, path: Path) -> h5py.Group:
+    try:
+        if file.attrs.get("format") == FORMAT:
+            return file["entry"]
+    except (OSError, RuntimeError, KeyError, UnicodeDecodeError) as error:
+        raise FileError(f"recording {path}: damaged ({error}). Remedy: try `rig recover` on a copy.") from error
+    raise FileError(
+        f"recording {path}: is not a recording of this rig. Remedy: choose a file that `rig run` has written."
+    )
+
+
+def _is_marked_open(path: Path) -> bool:
+    """Whether HDF5 finds the mark of a writer in the file."""
+    try:
+        with h5py.File(path, "r"):
+            return False
+    except (OSError, RuntimeError):
+        return True
+
+
+def _writer_lives(path: Path) -> bool:
+    """Whether the process that began the recording is still there (and is not another one with its number)."""
+    import psutil
+
+    try:
+        with _opened(path, swmr=True) as file:
+            info = json.loads(file["entry/configuration/run"].asstr()[()])
+            started = file["entry/configuration/process_started"].asstr()[()]
+    except (FileError, OSError, RuntimeError, KeyError, ValueError, UnicodeDecodeError):
+        return False
+    try:
+        return abs(psutil.Process(int(info["pid"])).create_time() - float(started)) < 2.0
+    except (psutil.Error, ValueError, KeyError):
+        return False
+
+
+def _copy(file: h5py.File, fresh: Path, samples: int, frames: int) -> None:
+    fresh.unlink(missing_ok=True)
+    with h5py.File(fresh, "w", libver="latest") as copy:
+        copy.attrs.update(file.attrs)
+        _copy_group(file, copy, samples, frames)
+        entry = copy["entry"]
+        if not len(entry["ending"]):
+            entry["ending"].resize(1, axis=0)
+            entry["ending"][0] = np.array((b"the program died; recovered", -9, samples, b""), ENDING)
+    with fresh.open("rb+") as written:
+        os.fsync(written.fileno())
+
+
+def _copy_group(source: h5py.Group, target: h5py.Group, samples: int, frames: int) -> None:
+    for name, item in source.items():
+        if isinstance(item, h5py.Group):
+            group = target.create_group(name)
+            group.attrs.update(item.attrs)
+            _copy_group(item, group, samples, frames)
+            continue
+        where = item.name.removeprefix("/entry/")
+        keep = samples if where in _PER_SAMPLE else frames if where in _PER_FRAME else None
+        if item.shape == ():
+            copied = target.create_dataset(name, data=item[()], dtype=item.dtype)
+        else:
+            copied = target.create_dataset(
+                name, data=item[:keep], dtype=item.dtype, maxshape=item.maxshape, chunks=item.chunks
+            )
+        copied.attrs.update(item.attrs)
