@@ -1,0 +1,348 @@
+"""The link between a run and its consoles: proof of the key, order, loss, commands, frozen and killed consoles."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pickle
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from multiprocessing.connection import Client
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.interfaces import PumpState, PumpStatus, StageStatus
+from rig import link as linking
+from rig import wire
+from rig.link import Address, Link, LinkError, LinkServer
+from rig.live import Estimate, LivePrediction
+from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan, Wish
+from sequences.frame import Frame
+
+SAMPLES = 20
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    directory = tmp_path / "runtime"
+    monkeypatch.setenv(linking.DIRECTORY_VARIABLE, str(directory))
+    return directory
+
+
+def run_info(**changes: Any) -> RunInfo:
+    plan = (StepPlan("tare", "2 s of samples"), StepPlan("retract", "pull-off"))
+    info = RunInfo(
+        "a title", "pull_off", "run.h5", os.getpid(), 1000.0, SAMPLES, True, plan,
+        {"force_compression_N": 1.5}, {"protocol": {"preload_N": 0.5}}, {"stage": "PI"}, False,
+    )  # fmt: skip
+    return dataclasses.replace(info, **changes)
+
+
+def frame(number: int, *, pressure: bool = True) -> Frame:
+    stage = StageStatus(number * 0.02, number * 0.02, 1e-3 + number * 1e-7, True, False, True, False, False)
+    pump = PumpStatus(0.0, 0.0, PumpState.WITHDRAWING, -1e-9, -2e-7) if pressure else None
+    force = np.arange(number * SAMPLES, (number + 1) * SAMPLES, dtype=np.float64)
+    return Frame(
+        number, number * SAMPLES, 1000.0, np.zeros((2, SAMPLES)), force, -force if pressure else None, stage, pump
+    )
+
+
+def prediction() -> LivePrediction:
+    x = np.linspace(0.0, 1e-3, 5)
+    one = Estimate(1.0, 0.9, float("inf"))
+    return LivePrediction(
+        7, 160, "cone", x, -x, -x - 1, -x + 1, None, one, one, one, one, 2e-3, True, "", 0.5, {"F": 1e-9}, 0.01
+    )
+
+
+def wait_for(condition: Any, what: str) -> None:
+    """Poll without asserting how long it takes; the test's own time-out bounds it."""
+    for _ in range(4000):
+        if condition():
+            return
+        time.sleep(0.005)
+    raise AssertionError(f"never: {what}")
+
+
+def take_until(link: Link, kind: type[Any]) -> list[Any]:
+    got: list[Any] = []
+    wait_for(lambda: (got.extend(link.take()), any(isinstance(m, kind) for m in got))[1], f"a {kind.__name__}")
+    return got
+
+
+MESSAGES = [
+    run_info(),
+    wire.samples_of([frame(3), frame(4)]),
+    wire.samples_of([frame(0, pressure=False)]),
+    StepEvent(StepPhase.PROGRESS, "preload", 40, "", 0.31, 0.5, "N"),
+    Event(3, "fault", "stage: no reply – \u00b5m"),
+    prediction(),
+    Ending("done", 0, 400, {"pull_off_force_N": {"value": 0.8}}),
+    wire.Gap(3),
+]
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
+def test_every_message_arrives_as_it_was_sent(message: Any) -> None:
+    received = wire.decode(wire.encode(message))
+    assert type(received) is type(message)
+    for field in dataclasses.fields(message):
+        sent, got = getattr(message, field.name), getattr(received, field.name)
+        np.testing.assert_equal(got, sent, err_msg=field.name)
+        assert type(got) is type(sent), field.name
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", b"\x01", b"\xff\xff\xff\xff{}", pickle.dumps(os.getcwd),
+        b"\x02\x00\x00\x00{}", wire.encode(Event(1, "note", "x"))[:-3],
+        wire.encode(Event(1, "note", "x")).replace(b'"note"', b'1234.5'),
+        wire.encode(wire.Gap(3)).replace(b'"gap"', b'"os."'),
+        wire.encode(MESSAGES[1])[:-1],
+        wire.encode(MESSAGES[1]).replace(b'"<f8"', b'"|O8"'),
+    ],
+)  # fmt: skip
+def test_what_is_no_message_is_refused(data: bytes) -> None:
+    with pytest.raises(wire.BadMessage, match="Remedy"):
+        wire.decode(data)
+
+
+def test_a_console_sees_the_run_in_order_and_complete() -> None:
+    with LinkServer(Controls()) as server:
+        server.started(run_info())
+        link = Link(server.address)
+        for number in range(200):
+            server.frame(frame(number))
+        server.event(Event(4000, "note", "half-way"))
+        for number in range(200, 300):
+            server.frame(frame(number))
+        server.finished(Ending("done", 0, 6000))
+        got = take_until(link, Ending)
+        link.close()
+    assert isinstance(got[0], RunInfo)
+    force = np.concatenate([message.force for message in got if isinstance(message, wire.Samples)])
+    np.testing.assert_array_equal(force, np.arange(6000.0))
+    place = next(index for index, message in enumerate(got) if isinstance(message, Event))
+    assert sum(message.force.size for message in got[:place] if isinstance(message, wire.Samples)) == 4000
+
+
+def test_who_attaches_late_sees_the_past_and_several_may_watch() -> None:
+    with LinkServer(Controls()) as server:
+        server.started(run_info())
+        first = Link(server.address)
+        for number in range(50):
+            server.frame(frame(number))
+        server.step(StepEvent(StepPhase.STARTED, "retract", 1000))
+        take_until(first, StepEvent)
+        (address,) = linking.running()
+        second = Link(address)
+        got = take_until(second, StepEvent)
+        assert isinstance(got[0], RunInfo)
+        assert sum(message.force.size for message in got if isinstance(message, wire.Samples)) == 1000
+        first.close()
+        second.close()
+    assert linking.running() == []
+
+
+def test_a_second_run_of_the_same_process_replaces_the_first() -> None:
+    with LinkServer(Controls()) as server:
+        server.started(run_info(repeat=1))
+        server.frame(frame(0))
+        server.finished(Ending("done", 0, 20))
+        server.started(run_info(repeat=2))
+        server.frame(frame(0))
+        first = Link(server.address)
+        got = take_until(first, wire.Samples)
+        assert [message.repeat for message in got if isinstance(message, RunInfo)][-1] == 2
+        first.close()
+
+
+def test_one_commands_and_the_others_may_still_stop_in_an_emergency() -> None:
+    controls = Controls()
+    stopped: list[str] = []
+    controls.connect(lambda: stopped.append(threading.current_thread().name))
+    with LinkServer(controls) as server:
+        server.started(run_info())
+        first, second = Link(server.address), Link(server.address)
+        assert first.command("hold").done
+        assert controls.take() is Wish.HOLD
+        refused = second.command("resume")
+        assert not refused.done
+        assert "another console" in refused.text
+        assert controls.take() is Wish.NONE
+        assert second.emergency_stop().done
+        assert stopped == ["link serve"]
+        assert controls.take() is Wish.EMERGENCY
+        first.close()
+        wait_for(lambda: second.command("claim").done, "the second console gets the word when the first has gone")
+        assert not second.command("explode").done
+        second.close()
+
+
+def test_nobody_without_the_key_is_listened_to(runtime: Path) -> None:
+    controls = Controls()
+    with LinkServer(controls) as server:
+        server.started(run_info())
+        wrong = Address("x", server.address.host, server.address.port, b"\0" * 32, os.getpid())
+        with pytest.raises(LinkError):
+            Link(wrong)
+        raw = Client((server.address.host, server.address.port))  # never answers the challenge with a proof
+        raw.recv_bytes()
+        raw.send_bytes(pickle.dumps({"role": "emergency", "who": "x"}))
+        raw.close()
+        silent = Client((server.address.host, server.address.port))
+        honest = Link(server.address)
+        take_until(honest, RunInfo)
+        assert controls.take() is Wish.NONE
+        silent.close()
+        honest.close()
+
+
+def test_a_server_without_the_key_is_not_believed() -> None:
+    from multiprocessing.connection import Listener
+
+    with Listener(("127.0.0.1", 0)) as listener:
+
+        def impostor() -> None:
+            connection = listener.accept()
+            connection.send_bytes(b"\0" * 32)
+            connection.recv_bytes()
+            connection.send_bytes(b"\0" * 32)
+            connection.close()
+
+        thread = threading.Thread(target=impostor)
+        thread.start()
+        host, port = listener.address
+        with pytest.raises(LinkError, match="not the run"):
+            Link(Address("x", host, port, b"k" * 32, os.getpid()))
+        thread.join()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX modes; Windows profiles are private by their access list")
+def test_the_address_file_is_the_users_alone(runtime: Path) -> None:
+    with LinkServer(Controls()) as server:
+        (path,) = runtime.glob("*.json")
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(runtime.stat().st_mode) == 0o700
+        assert json.loads(path.read_text())["port"] == server.address.port
+        path.chmod(0o644)
+        with pytest.raises(LinkError, match="other users"):
+            linking.running()
+    runtime.chmod(0o755)
+    with pytest.raises(LinkError, match="other users"):
+        LinkServer(Controls())
+
+
+def test_a_damaged_address_file_is_named(runtime: Path) -> None:
+    runtime.mkdir(mode=0o700)
+    path = runtime / "run-1.json"
+    path.write_text("{")
+    path.chmod(0o600)
+    with pytest.raises(LinkError, match=r"run-1\.json is damaged"):
+        linking.running()
+
+
+def test_memory_for_a_console_that_lags_is_bounded_and_the_loss_is_told() -> None:
+    log = linking._Log(1000)
+    log.append(b"run", forgettable=False)
+    for number in range(100):
+        log.append(bytes([number]) * 100, forgettable=True)
+    log.append(b"end", forgettable=False)
+    cursor, got, missed = 0, [], 0
+    while True:
+        cursor, lost, data = log.next(cursor)
+        missed += lost
+        if data is None:
+            break
+        got.append(data)
+    assert got[0] == b"run"
+    assert got[-1] == b"end"
+    assert [data[0] for data in got[1:-1]] == list(range(90, 100))
+    assert missed == 90
+
+
+def test_the_loops_queue_is_bounded_and_drops_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linking, "INBOX_FRAMES", 10)
+    monkeypatch.setattr(LinkServer, "_pack", lambda self: self._closing.wait())
+    with LinkServer(Controls()) as server:
+        for number in range(25):
+            server.frame(frame(number))
+        assert server.dropped == 15
+        assert [held.number for held in server._inbox] == list(range(15, 25))
+
+
+CONSOLE = """
+import sys, time
+from rig.link import Link, running
+link = Link(running()[0])
+link.command("claim")
+while not list(link.take()):
+    time.sleep(0.01)
+print("attached", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGSTOP to freeze a process")
+@pytest.mark.parametrize("harm", [signal.SIGSTOP, signal.SIGKILL], ids=["frozen", "killed"])
+def test_a_frozen_or_killed_console_takes_nothing_from_the_run(harm: signal.Signals) -> None:
+    with LinkServer(Controls(), memory=200_000) as server:
+        server.started(run_info())
+        with subprocess.Popen([sys.executable, "-c", CONSOLE], stdout=subprocess.PIPE, text=True) as console:
+            assert console.stdout is not None
+            assert console.stdout.readline() == "attached\n"
+            os.kill(console.pid, harm)
+            for number in range(30_000):  # far more than any socket buffer holds
+                server.frame(frame(number))
+                if number % 200 == 0:
+                    time.sleep(0.001)
+            healthy = Link(server.address)
+            server.finished(Ending("done", 0, 600_000))
+            assert take_until(healthy, Ending)
+            assert server.dropped == 0
+            assert server._log._held <= 200_000
+            healthy.close()
+            server.close(drain_s=0.1)
+            console.kill()
+
+
+RUN = """
+import sys, time
+from rig.link import LinkServer
+from rig.observe import Controls
+
+class Hung(Controls):
+    def emergency_stop(self): time.sleep(600)
+    def stop(self): time.sleep(600)
+
+server = LinkServer(Hung())
+print("serving", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("command", ["stop", "emergency stop"])
+def test_a_stop_that_is_not_acknowledged_kills_the_run(command: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", RUN], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "serving\n"
+        link = Link(linking.running()[0])
+        answer = link.emergency_stop() if command == "emergency stop" else link.command("stop")
+        assert link.killed
+        assert "killed" in answer.text
+        assert run.wait() != 0
+        wait_for(lambda: link.over, "the link notices")
+        assert not link.emergency_stop().done  # and nobody else is killed
+        link.close()
+    with pytest.raises(LinkError, match="cannot be reached"):
+        Link(linking.running()[0])
+    assert linking.running() == []
