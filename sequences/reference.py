@@ -1,0 +1,45 @@
+"""Referencing: the stage seeks its switch, away from the sample, then parks. Only on the operator's explicit word."""
+
+from __future__ import annotations
+
+import math
+
+from sequences.errors import StepFailed
+from sequences.frame import Frame
+from sequences.step import Apparatus, Motion, Step, Steps, stopping_on_failure
+
+PARK_SPEED = 1e-3
+LONGEST_SECONDS = 120.0
+
+
+def reference(apparatus: Apparatus) -> list[Step]:
+    """Return the steps that reference the axis and park it at the highest allowed position."""
+
+    def seek(frame: Frame) -> Steps:
+        with stopping_on_failure(apparatus.stage):
+            apparatus.stage.reference()
+            deadline = frame.stop + round(LONGEST_SECONDS * frame.rate)
+            frame = yield
+            while frame.stage.moving or not apparatus.stage.referenced:
+                if frame.stop > deadline:
+                    raise StepFailed("reference", "the switch is not found", "check the stage's cable and its switches")
+                frame = yield
+            apparatus.stage.servo(True)
+        return frame
+
+    def park(frame: Frame) -> Steps:
+        target = apparatus.stage.travel[1]
+        motion = Motion(apparatus, target, PARK_SPEED, look_ahead=math.inf)
+        deadline = frame.stop + round(LONGEST_SECONDS * frame.rate)
+        try:
+            while not motion.arrived(frame):
+                motion.extend(frame)
+                frame = yield
+                apparatus.tell.progress(frame.stage.position, target, "m")
+                if frame.stop > deadline:
+                    raise StepFailed("park", "the stage does not arrive", "check the path and the stage's servo")
+        finally:
+            apparatus.stage.stop()
+        return frame
+
+    return [Step("reference", "the switch is found", seek), Step("park", "at the top of the travel", park)]
