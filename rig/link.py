@@ -528,6 +528,7 @@ class Link:
         try:
             connection = Client((self.address.host, self.address.port))
         except OSError as error:
+            _forget(self.address)
             raise LinkError(
                 f"link: run {self.address.name} cannot be reached ({error}). Remedy: is it over?"
             ) from error
