@@ -1,0 +1,185 @@
+"""The registry of extraction steps and the state they share.
+
+A step is one function: it reads what earlier steps found, decides something, stores the numbers it ``gives`` and returns the
+``details`` that show *why* it decided so; the overview picture and the report draw them. Adding a feature is adding one function:
+
+    @extraction_step("pull-off", title="Pull-off force", after=("tare",), gives={"pull_off_force_N": "largest tension"})
+    def pull_off(work: Extraction) -> Details: ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from analysis.errors import FeatureMissing
+from analysis.numerics import Array, ForceJump, LocalFit, Noise
+from analysis.run import Run
+
+Details = Mapping[str, object]
+"""Decision in words under ``"decision"``; arrays, indices and thresholds for the plot under other keys."""
+
+
+@dataclass(frozen=True, slots=True)
+class Windows:
+    """Sample ranges of one run, from the step events: (start, stop), stop exclusive; ``None`` where the run has no such part."""
+
+    free: tuple[int, int]
+    approach: tuple[int, int] | None
+    dwell: tuple[int, int] | None
+    pressurize: tuple[int, int] | None
+    retraction: tuple[int, int] | None
+    end: int
+
+
+@dataclass
+class Extraction:
+    """One pass over one run. Steps set the attributes; those that follow read them."""
+
+    run: Run
+    values: dict[str, float] = field(default_factory=dict)
+    details: dict[str, Details] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    methods: dict[str, dict[str, float]] = field(default_factory=dict)
+    windows: Windows = field(init=False)
+    noise: Noise = field(init=False)
+    baseline: np.polynomial.Polynomial = field(init=False)
+    detached: int | None = field(init=False, default=None)
+    force: Array = field(init=False)
+    separation: Array = field(init=False)
+    contact_start: int = field(init=False)
+    jumps: list[ForceJump] = field(init=False, default_factory=list)
+    zero: float = field(init=False)
+    zero_separation: float = field(init=False)
+    release: float = field(init=False)
+    release_separation: float = field(init=False)
+    peak: float = field(init=False)
+    peak_fit: LocalFit = field(init=False)
+
+    def set(self, **values: float) -> None:
+        """Store features by their registered names."""
+        self.values.update(values)
+
+    def retraction(self) -> tuple[int, int]:
+        """Return start and stop of the retraction, or raise ``FeatureMissing``."""
+        if self.windows.retraction is None:
+            raise FeatureMissing("the run has no retraction")
+        return self.windows.retraction
+
+    def at(self, signal: Array, index: float) -> float:
+        """Return a signal between two samples."""
+        return float(np.interp(index, np.arange(signal.size), signal)) if index % 1 else float(signal[int(index)])
+
+
+@dataclass(frozen=True)
+class ExtractionStep:
+    """One registered step."""
+
+    name: str
+    title: str
+    gives: Mapping[str, str]
+    after: tuple[str, ...]
+    uses: tuple[str, ...]
+    protocols: tuple[str, ...]
+    function: Callable[[Extraction], Details]
+
+    @property
+    def explanation(self) -> str:
+        """How the step decides: the function's docstring."""
+        return (self.function.__doc__ or "").strip()
+
+
+STEPS: dict[str, ExtractionStep] = {}
+"""Registered steps by name; ``ordered`` puts them in the order they run."""
+
+
+def extraction_step(
+    name: str,
+    *,
+    title: str,
+    gives: Mapping[str, str] | None = None,
+    after: Iterable[str] = (),
+    uses: Iterable[str] = (),
+    protocols: Iterable[str] = (),
+) -> Callable[[Callable[[Extraction], Details]], Callable[[Extraction], Details]]:
+    """Register a step.
+
+    Parameters
+    ----------
+    name, title
+        Short and readable name.
+    gives
+        Features the step finds, with what they are. The unit is the end of the name.
+    after
+        Steps that must have succeeded.
+    uses
+        Steps that come first but may have failed.
+    protocols
+        Protocols the step belongs to; all where empty.
+    """
+
+    def register(function: Callable[[Extraction], Details]) -> Callable[[Extraction], Details]:
+        STEPS[name] = ExtractionStep(
+            name, title, dict(gives or {}), tuple(after), tuple(uses), tuple(protocols), function
+        )
+        return function
+
+    return register
+
+
+UNITS = {
+    "N": "N",
+    "m": "m",
+    "Pa": "Pa",
+    "J": "J",
+    "s": "s",
+    "m2": "m^2",
+    "m3": "m^3",
+    "N_m": "N/m",
+    "N_s": "N/s",
+    "J_m2": "J/m^2",
+    "Pa_s": "Pa/s",
+    "m3_s": "m^3/s",
+    "count": "",
+    "fraction": "",
+}
+
+
+def unit_of(feature: str) -> str:
+    """Return the SI unit that ends a feature's name."""
+    ends = (end for end in sorted(UNITS, key=len, reverse=True) if feature.endswith("_" + end))
+    return UNITS[next(ends)]
+
+
+def meanings() -> dict[str, str]:
+    """Return what each registered feature is, in order."""
+    return {name: text for step in ordered() for name, text in step.gives.items()}
+
+
+def ordered() -> list[ExtractionStep]:
+    """Return the registered steps, each behind those it needs or uses."""
+    from graphlib import TopologicalSorter
+
+    graph = {step.name: (*step.after, *step.uses) for step in STEPS.values()}
+    return [STEPS[name] for name in TopologicalSorter(graph).static_order()]
+
+
+def extract(run: Run) -> Extraction:
+    """Run every step that applies; a step that finds nothing leaves its features missing, with the reason."""
+    work = Extraction(run)
+    for step in ordered():
+        if step.protocols and run.protocol not in step.protocols:
+            continue
+        reason = next((f"needs {name}: {work.failed[name]}" for name in step.after if name in work.failed), None)
+        if reason is None:
+            try:
+                work.details[step.name] = step.function(work)
+            except FeatureMissing as error:
+                reason = str(error)
+        if reason is not None:
+            work.failed[step.name] = reason
+            work.missing.update(dict.fromkeys(step.gives, reason))
+    return work

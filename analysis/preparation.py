@@ -1,0 +1,191 @@
+"""Segments, tare, drift, noise and compliance: what comes before any feature."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from analysis.errors import AnalysisError, FeatureMissing
+from analysis.extraction import Details, Extraction, Windows, extraction_step
+from analysis.numerics import Array, Noise, block_means, running_mean
+from analysis.run import Run
+
+SMOOTHING = 0.02
+"""Width of the running mean used to find places (never values), s."""
+
+NOISE_MEMORY = 0.1
+"""Block length on which the colour of the noise is measured, s."""
+
+
+@extraction_step("segments", title="Segments")
+def segments(work: Extraction) -> Details:
+    """Take the segments from the recorded step events, and check them against the data.
+
+    The retraction runs from the start of ``retract`` to the end of ``pull-off``. Without ``tare`` the first part of the approach
+    serves as force-free. Checks: the stage rises in the retraction, falls in the approach, and rests in the dwell.
+    """
+    run = work.run
+    if run.force.size < 16:
+        raise AnalysisError(f"{run.name}: only {run.force.size} samples; nothing to analyse")
+    retract, pull_off = run.step("retract"), run.step("pull-off")
+    retraction = None
+    if retract is not None and retract.stop - retract.start > 8:
+        stop = pull_off.stop if pull_off is not None and pull_off.start >= retract.stop else retract.stop
+        retraction = (retract.start, min(stop, run.force.size))
+    approach = _between(run, "approach", "preload")
+    tare = run.step("tare")
+    if tare is not None:
+        free = (tare.start, tare.stop)
+    elif approach is not None:
+        free = (approach[0], approach[0] + max(16, (approach[1] - approach[0]) // 20))
+    else:
+        raise AnalysisError(f"{run.name}: neither a tare nor an approach step; the zero of force is unknown")
+    if free[1] - free[0] < 16:
+        raise AnalysisError(f"{run.name}: the tare holds {free[1] - free[0]} samples; at least 16 are needed")
+    work.windows = Windows(
+        free, approach, _between(run, "dwell"), _between(run, "pressurize"), retraction, run.force.size
+    )
+    checks = {
+        "the stage falls during the approach": _moves(run.height, approach, -1),
+        "the stage rests during the dwell": _moves(run.height, work.windows.dwell, 0),
+        "the stage rises during the retraction": _moves(run.height, retraction, +1),
+    }
+    failures = [text for text, fulfilled in checks.items() if fulfilled is False]
+    decision = "from the step events" + (
+        "; contradicted by the data: " + "; ".join(failures) if failures else ", confirmed by the data"
+    )
+    return {"decision": decision, "checks": checks}
+
+
+def _between(run: Run, first: str, last: str | None = None) -> tuple[int, int] | None:
+    begin = run.step(first)
+    end = begin if last is None else run.step(last) or begin
+    if begin is None or end is None or end.stop - begin.start < 8:
+        return None
+    return begin.start, min(end.stop, run.force.size)
+
+
+def _moves(height: Array, window: tuple[int, int] | None, direction: int) -> bool | None:
+    if window is None:
+        return None
+    travel = float(height[window[1] - 1] - height[window[0]])
+    return bool(abs(travel) < 5e-6) if direction == 0 else bool(direction * travel > 0)
+
+
+@extraction_step(
+    "tare",
+    title="Tare and drift",
+    after=("segments",),
+    gives={
+        "force_noise_N": "standard deviation of one force sample, out of contact",
+        "force_drift_N_s": "drift of the zero of force, fitted jointly before contact and after detachment",
+        "baseline_residual_N": "force left after detachment once tare and drift are removed (quality)",
+    },
+)
+def tare(work: Extraction) -> Details:
+    """Fit one straight line in time to all force-free samples: tare, approach before contact, and after detachment.
+
+    1. Level and noise from the tare. Going back from the end of the approach, contact begins after the last sample whose running
+       mean lies within five standard deviations of that level; a margin before it is left out.
+    2. The sample has come off when the force ends within a quarter of the largest tension from the level; detachment is the last
+       crossing of three per cent of it.
+    3. Block means before contact and after detachment, equally weighted, give level and drift by least squares.
+    """
+    run = work.run
+    free_start, free_stop = work.windows.free
+    level = float(np.median(run.force[free_start:free_stop]))
+    noise = Noise.measure(_without_trend(run.force[free_start:free_stop]), _memory(run))
+    width = max(3, round(SMOOTHING * run.rate))
+    smooth = running_mean(run.force, width)
+    contact = _contact_onset(work, smooth, level, noise.of_mean(width))
+    margin = max(round(0.2 * run.rate), width)
+    before = (free_start, max(free_stop, contact - margin))
+    work.contact_start = contact
+    work.detached = _rough_detachment(work, smooth, level, noise.of_mean(width))
+    after = _after_detachment(work, margin)
+    windows = [before] if after is None else [before, after]
+    work.baseline = _fit_line(run.force, windows)
+    times = np.arange(run.force.size, dtype=np.float64)
+    work.force = run.force - work.baseline(times)
+    residual = np.concatenate([_without_trend(run.force[slice(*window)]) for window in windows])
+    work.noise = Noise.measure(residual, _memory(run))
+    work.set(force_noise_N=work.noise.sigma, force_drift_N_s=float(work.baseline.deriv()(0.0)) * run.rate)
+    if after is not None:
+        work.set(baseline_residual_N=float(work.force[slice(*after)].mean()))
+    else:
+        work.missing["baseline_residual_N"] = "the recording holds no force-free part after detachment"
+    how = "before contact and after detachment" if after is not None else "before contact only"
+    return {"decision": f"line through {how}", "windows": windows, "baseline": work.baseline, "contact": contact}
+
+
+def _memory(run: Run) -> int:
+    return max(1, round(NOISE_MEMORY * run.rate))
+
+
+def _without_trend(values: Array) -> Array:
+    places = np.arange(values.size, dtype=np.float64)
+    return np.asarray(values - np.polynomial.Polynomial.fit(places, values, 1)(places), dtype=np.float64)
+
+
+def _contact_onset(work: Extraction, smooth: Array, level: float, sigma: float) -> int:
+    window = work.windows.approach
+    if window is None:
+        return work.windows.free[1]
+    quiet = np.flatnonzero(np.abs(smooth[window[0] : window[1]] - level) < 5 * sigma)
+    return window[0] + (int(quiet[-1]) if quiet.size else 0)
+
+
+def _rough_detachment(work: Extraction, smooth: Array, level: float, sigma: float) -> int | None:
+    """Return the sample after which no tension is left, or ``None`` while still attached or never adhered."""
+    if work.windows.retraction is None:
+        return None
+    start, stop = work.windows.retraction
+    force = smooth[start:] - level
+    lowest = int(np.argmin(force[: stop - start]))
+    peak = float(force[lowest])
+    tail = float(np.median(force[-max(8, min(round(0.5 * work.run.rate), (force.size - lowest) // 4)) :]))
+    if peak > -8 * sigma or tail < 0.25 * peak:
+        return None
+    tense = np.flatnonzero(force[lowest:] < tail - max(5 * sigma, 0.03 * -peak))
+    return start + lowest + (int(tense[-1]) if tense.size else 0)
+
+
+def _after_detachment(work: Extraction, margin: int) -> tuple[int, int] | None:
+    if work.detached is None:
+        return None
+    start = work.detached + max(margin, (work.windows.end - work.detached) // 20)
+    return (start, work.windows.end) if work.windows.end - start >= margin else None
+
+
+def _fit_line(force: Array, windows: list[tuple[int, int]]) -> np.polynomial.Polynomial:
+    """Least squares over block means; every part of the record counts by its length, a short record is only levelled."""
+    places, means = [], []
+    for start, stop in windows:
+        length = max(1, (stop - start) // 200)
+        blocks = block_means(force[start:stop], length)
+        means.append(blocks)
+        places.append(start + (length - 1) / 2 + length * np.arange(blocks.size))
+    weights = np.concatenate(
+        [np.full(p.size, np.sqrt((stop - start) / p.size)) for p, (start, stop) in zip(places, windows, strict=True)]
+    )
+    where = np.concatenate(places)
+    fit = np.polynomial.Polynomial.fit(where, np.concatenate(means), 1, w=weights)
+    return fit.convert()
+
+
+@extraction_step("compliance", title="Separation", after=("tare",))
+def compliance(work: Extraction) -> Details:
+    """Correct the stage's position for the compliance C of load cell, fixture and frame: separation = height + F C.
+
+    The force used is the tared one, sample by sample; with C unknown (zero) the separation is the stage's height.
+    """
+    constant = work.run.sensors.compliance
+    work.separation = work.run.height + work.force * constant if constant else work.run.height
+    return {"decision": f"C = {constant * 1e6:.3g} µm/N", "compliance": constant}
+
+
+def require_adhesion(work: Extraction) -> None:
+    """Raise ``FeatureMissing`` unless the retraction shows tension."""
+    start, stop = work.retraction()
+    width = max(3, round(SMOOTHING * work.run.rate))
+    if float(running_mean(work.force[start:stop], width).min()) > -8 * work.noise.of_mean(width):
+        raise FeatureMissing("no tension above the noise in the retraction")

@@ -1,0 +1,150 @@
+"""Uncertainty from calibration, noise, drift, contact point and sampling, carried to every number.
+
+The whole extraction is repeated on perturbed copies of the run: once per systematic source (its effect is taken as linear), and on
+``DRAWS`` copies with fresh noise resampled from the force-free part of the record. Seeds are fixed: re-running gives the same digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from analysis.extraction import Extraction, extract
+from analysis.numerics import Array, Noise, block_means
+from analysis.run import Run
+
+DRAWS = 16
+"""Copies with fresh noise."""
+
+SEED = 20170516
+
+
+def budget(work: Extraction) -> dict[str, dict[str, float]]:
+    """Return, for each feature, its standard uncertainty by source."""
+    parts: dict[str, dict[str, float]] = {name: {} for name in work.values}
+    for source, changed in _systematic(work):
+        for name, value in extract(changed).values.items():
+            if name in parts:
+                _add(parts[name], source, value - work.values[name])
+    for name, spread in _noise(work).items():
+        _add(parts[name], "noise", spread)
+    for name, sources in _sampling(work).items():
+        _add(parts[name], "sampling", sources)
+    if "contact_height_m" in parts:
+        _add(parts["contact_height_m"], "contact point", work.values["contact_spread_m"])
+    return parts
+
+
+def _add(parts: dict[str, float], source: str, contribution: float) -> None:
+    if np.isfinite(contribution) and contribution != 0:
+        parts[source] = float(np.hypot(parts.get(source, 0.0), contribution))
+
+
+def _systematic(work: Extraction) -> Iterator[tuple[str, Run]]:
+    """Yield the run with each systematic source changed by one standard uncertainty."""
+    run, sensors = work.run, work.run.sensors
+    changes: list[tuple[str, float, Callable[[float], Run]]] = [
+        ("force calibration", sensors.force_gain, lambda u: replace(run, force=run.force * (1 + u))),
+        ("force linearity", sensors.force_linearity, lambda u: replace(run, force=_bent(work, u))),
+        ("position", sensors.position, lambda u: replace(run, height=run.height * (1 + u))),
+        (
+            "compliance",
+            sensors.compliance_uncertainty,
+            lambda u: replace(run, sensors=replace(sensors, compliance=sensors.compliance + u)),
+        ),
+        ("drift", _drift_excess(work), lambda u: replace(run, force=run.force + _bump(work, u))),
+    ]
+    pressure = run.pressure
+    if pressure is not None:
+        changes += [
+            ("pressure calibration", sensors.pressure_gain, lambda u: replace(run, pressure=pressure * (1 + u))),
+            ("pressure zero", sensors.pressure_offset, lambda u: replace(run, pressure=pressure + u)),
+        ]
+    for source, uncertainty, change in changes:
+        if uncertainty > 0:
+            yield source, change(uncertainty)
+
+
+def _bent(work: Extraction, uncertainty: float) -> Array:
+    """A calibration curve that is out by ``uncertainty`` at any load but zero, with the sign of the load."""
+    scale = max(float(np.abs(work.force).max()), 1e-12)
+    return np.asarray(work.run.force + uncertainty * np.tanh(20 * work.force / scale), dtype=np.float64)
+
+
+def _drift_excess(work: Extraction) -> float:
+    """How far the zero may have wandered from the fitted line in contact: what its force-free parts show beyond their noise."""
+    windows = work.details["tare"]["windows"]
+    assert isinstance(windows, list)
+    excess = 0.0
+    for start, stop in windows:
+        length = max(1, (stop - start) // 12)
+        means = block_means(work.force[start:stop], length)
+        excess = max(excess, float(np.mean(means**2)) - work.noise.of_mean(length) ** 2)
+    return float(np.sqrt(max(excess, 0.0)))
+
+
+def _bump(work: Extraction, height: float) -> Array:
+    """A wander of the zero between the force-free parts, none within them."""
+    start = work.contact_start
+    stop = work.detached if work.detached is not None else work.windows.end
+    bump = np.zeros(work.run.force.size)
+    bump[start:stop] = height
+    return bump
+
+
+def _noise(work: Extraction) -> Mapping[str, float]:
+    generator = np.random.default_rng(SEED)
+    run = work.run
+    pressure_noise = _pressure_noise(work)
+    samples: dict[str, list[float]] = {name: [] for name in work.values}
+    for _ in range(DRAWS):
+        changed = replace(run, force=run.force + work.noise.draw(run.force.size, generator))
+        if run.pressure is not None and pressure_noise is not None:
+            changed = replace(changed, pressure=run.pressure + pressure_noise.draw(run.pressure.size, generator))
+        for name, value in extract(changed).values.items():
+            if name in samples:
+                samples[name].append(value - work.values[name])
+    return {name: _spread(np.array(values)) for name, values in samples.items() if len(values) >= DRAWS // 2}
+
+
+def _spread(differences: Array) -> float:
+    """Standard deviation among the copies; one wild copy in sixteen does not count (scaled quantile range)."""
+    ordinary = float(differences.std(ddof=1))
+    lower, upper = np.quantile(differences, [0.16, 0.84])
+    robust = float(upper - lower) / 1.9
+    return robust if ordinary > 3 * robust > 0 else ordinary
+
+
+def _pressure_noise(work: Extraction) -> Noise | None:
+    if work.run.pressure is None or "pressure" not in work.details:
+        return None
+    start, stop = work.windows.free
+    part = work.run.pressure[start:stop]
+    places = np.arange(part.size, dtype=np.float64)
+    residual = np.asarray(part - np.polynomial.Polynomial.fit(places, part, 1)(places), dtype=np.float64)
+    return Noise.measure(residual, max(1, round(0.1 * work.run.rate)))
+
+
+def _sampling(work: Extraction) -> dict[str, float]:
+    """Return what the finite sample rate adds: the instant of a jump is known to within its samples, a peak to within its bias."""
+    found: dict[str, float] = {}
+    values = work.values
+    if "pull_off_distance_m" in values:
+        speed = _speed(work, work.release)
+        width = values.get("snap_duration_s", 1 / work.run.rate) * work.run.rate
+        found["pull_off_distance_m"] = speed * max(width, 1.0) / np.sqrt(12.0)
+    if "pull_off_force_N" in values:
+        found["pull_off_force_N"] = values["sampling_bias_N"]
+        found["retraction_at_pull_off_m"] = _speed(work, work.peak) / np.sqrt(12.0)
+    if "snap_duration_s" in values:
+        found["snap_duration_s"] = np.sqrt(2 / 12.0) / work.run.rate
+    return found
+
+
+def _speed(work: Extraction, index: float) -> float:
+    """Travel per sample around an index, m."""
+    reach = max(4, round(0.05 * work.run.rate))
+    left, right = max(0, int(index) - reach), min(work.run.height.size - 1, int(index) + reach)
+    return abs(float(work.run.height[right] - work.run.height[left])) / (right - left)

@@ -1,0 +1,347 @@
+"""From the zero of force to detachment: z_r, F_p, D_p, jumps, snap, energies, pressure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from analysis.errors import FeatureMissing
+from analysis.extraction import Details, Extraction, extraction_step
+from analysis.numerics import Array, Noise, find_jumps, fit_around, running_mean
+from analysis.preparation import SMOOTHING, require_adhesion
+
+
+@extraction_step(
+    "zero crossing",
+    title="Zero of force and of z_r",
+    after=("compliance",),
+    gives={
+        "zero_force_height_m": "separation where F_r passes from compression to tension: z_r = 0",
+        "stiffness_at_zero_N_m": "-dF_r/dz there",
+    },
+)
+def zero_crossing(work: Extraction) -> Details:
+    """Find the last crossing from compression to tension before the largest tension.
+
+    1. A running mean of 20 ms brackets the crossing.
+    2. A cubic is fitted around it, up to a tenth of the retraction either way, in the widest window whose residuals are noise;
+       its root is the zero.
+    3. Force that is tensile from the start (suction on a flat) has its zero of z_r at the start of the retraction.
+    """
+    require_adhesion(work)
+    start, stop = work.retraction()
+    width = max(3, round(SMOOTHING * work.run.rate))
+    smooth = running_mean(work.force[start:stop], width)
+    lowest = int(np.argmin(smooth))
+    compressed = np.flatnonzero(smooth[: lowest + 1] > 0)
+    if compressed.size == 0 or float(smooth[: width + 1].max()) < 2 * work.noise.of_mean(width):
+        work.zero = float(start)
+        decision = "tensile from the start: z_r = 0 at the start of the retraction"
+        slope = np.nan
+        work.missing["stiffness_at_zero_N_m"] = "the force does not cross zero"
+    else:
+        index = start + int(compressed[-1])
+        reach = max(16, (stop - start) // 10)
+        fit = fit_around(work.force, index, max(start, index - reach), min(start + lowest, index + reach), work.noise)
+        root = fit.root(index)
+        work.zero = float(index) if root is None else root
+        climb = _slope(work.separation, index, reach)
+        slope = -fit.slope(work.zero) / climb if climb > 0 else np.nan
+        decision = f"root of a cubic over {(fit.stop - fit.start) / work.run.rate:.2g} s"
+        work.set(stiffness_at_zero_N_m=slope)
+    work.zero_separation = work.at(work.run.height, work.zero) + work.run.sensors.compliance * _force_at_zero(
+        work, start
+    )
+    work.set(zero_force_height_m=work.zero_separation)
+    return {"decision": decision, "index": work.zero}
+
+
+def _force_at_zero(work: Extraction, start: int) -> float:
+    """Zero by definition, unless the force is tensile from the start."""
+    if work.zero > start:
+        return 0.0
+    width = max(3, round(SMOOTHING * work.run.rate))
+    return float(work.force[start : start + width].mean())
+
+
+def _slope(signal: Array, index: int, reach: int) -> float:
+    left, right = max(0, index - reach), min(signal.size, index + reach)
+    return float((signal[right - 1] - signal[left]) / (right - 1 - left))
+
+
+@extraction_step(
+    "jumps",
+    title="Jumps",
+    after=("zero crossing",),
+    gives={
+        "jumps_count": "sudden changes of force in the retraction, detachment included",
+        "largest_jump_N": "change of force in the largest of them",
+    },
+)
+def jumps(work: Extraction) -> Details:
+    """Find sudden changes: means over 20 ms before and after differ by six standard deviations and one per cent of the tension.
+
+    A line fitted on either side of each candidate must confirm it, so that steep but smooth stretches do not count.
+    """
+    start, stop = work.retraction()
+    width = max(4, round(SMOOTHING * work.run.rate))
+    tension = -float(running_mean(work.force[start:stop], width).min())
+    reach = min(work.windows.end, stop + 8 * width)
+    shifted = find_jumps(work.force[start:reach], work.noise, width, 0.01 * tension)
+    work.jumps = [type(j)(j.start + start, j.stop + start, j.before, j.after, j.slope_before) for j in shifted]
+    work.set(jumps_count=float(len(work.jumps)))
+    if work.jumps:
+        work.set(largest_jump_N=max((jump.size for jump in work.jumps), key=abs))
+    else:
+        work.missing["largest_jump_N"] = "the force changes without a jump"
+    return {"decision": f"{len(work.jumps)} found", "jumps": tuple(work.jumps)}
+
+
+@extraction_step(
+    "detachment",
+    title="Detachment and D_p",
+    after=("jumps",),
+    gives={
+        "pull_off_distance_m": "D_p: separation at full detachment minus that at the zero of force",
+        "snap_force_N": "tension just before the final jump",
+        "snap_duration_s": "duration of the final jump",
+    },
+)
+def detachment(work: Extraction) -> Details:
+    """Detachment is the last jump that releases the tension for good; half-way through it.
+
+    Without such a jump: where the tension, fitted by a line over its last part, falls below four standard deviations of a 20 ms mean.
+    The separation is the stage's height then, corrected by the compliance for the force just before.
+    """
+    start, stop = work.retraction()
+    width = max(4, round(SMOOTHING * work.run.rate))
+    noise = work.noise.of_mean(width)
+    smooth = running_mean(work.force[start : work.windows.end], width)
+    tension = -float(smooth[: stop - start].min())
+    if work.detached is None:
+        raise FeatureMissing("still attached at the end of the recording")
+    band = max(5 * noise, 0.04 * tension)
+    releases = [
+        j
+        for j in work.jumps
+        if j.size > 0 and float(smooth[min(j.stop + 2 * width - start, smooth.size - 1) :].min()) > -band
+    ]
+    if releases:
+        jump = releases[0]
+        work.release = jump.middle
+        before = jump.before
+        work.set(snap_force_N=-before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
+        decision = f"jump of {jump.size * 1e3:.1f} mN within {(jump.stop - jump.start) / work.run.rate * 1e3:.3g} ms"
+    else:
+        tense = np.flatnonzero(smooth[: work.detached + 2 * width - start] < -4 * noise)
+        work.release = float(start + (tense[-1] if tense.size else 0))
+        before = float(smooth[int(work.release) - start])
+        work.missing.update(dict.fromkeys(("snap_force_N", "snap_duration_s"), "the tension fades without a jump"))
+        decision = "the tension fades into the noise"
+    work.release_separation = work.at(work.run.height, work.release) + work.run.sensors.compliance * before
+    work.set(pull_off_distance_m=work.release_separation - work.zero_separation)
+    return {"decision": decision, "index": work.release}
+
+
+@extraction_step(
+    "pull-off",
+    title="Pull-off force",
+    after=("jumps",),
+    gives={
+        "pull_off_force_N": "F_p: largest tension, a magnitude",
+        "retraction_at_pull_off_m": "z_r at F_p",
+        "sampling_bias_N": "how much of the peak the finite sample rate misses",
+    },
+)
+def pull_off(work: Extraction) -> Details:
+    """Fit a cubic around the largest tension, in the widest window whose residuals are noise, but never across a jump.
+
+    Where the peak lies at a jump, the force was still growing when the contact let go: on average half a sample's growth is missed.
+    A smooth peak misses curvature dt^2 / 24.
+    """
+    start, stop = work.retraction()
+    left, right = max(start, int(np.floor(work.zero))), min(stop, work.windows.end)
+    width = max(3, round(0.005 * work.run.rate))
+    index = left + int(np.argmin(running_mean(work.force[left:right], width)))
+    index, left, right = _side_of_jump(work, index, left, right)
+    fit = fit_around(work.force, index, left, right, work.noise)
+    work.peak, value = fit.minimum()
+    work.peak_fit = fit
+    at_jump = any(abs(work.peak - jump.start) <= 1 for jump in work.jumps)
+    bias = abs(fit.slope(work.peak)) / 2 if at_jump else abs(fit.curvature(work.peak)) / 24
+    separation = work.at(work.run.height, work.peak) + work.run.sensors.compliance * value
+    work.set(
+        pull_off_force_N=-value,
+        retraction_at_pull_off_m=separation - work.zero_separation,
+        sampling_bias_N=bias,
+    )
+    where = "at a jump" if at_jump else "smooth"
+    return {
+        "decision": f"{where} peak of a cubic over {(fit.stop - fit.start) / work.run.rate:.2g} s",
+        "index": work.peak,
+        "fit": fit,
+    }
+
+
+def _side_of_jump(work: Extraction, index: int, left: int, right: int) -> tuple[int, int, int]:
+    """Keep the window between two jumps. A peak within a jump belongs to the side of larger tension."""
+    for jump in work.jumps:
+        if jump.start <= index <= jump.stop or (abs(index - jump.middle) < 0.01 * work.run.rate):
+            index = jump.start if jump.before < jump.after else jump.stop
+        if jump.start >= index:
+            right = min(right, jump.start + 1)
+        elif jump.stop <= index:
+            left = max(left, jump.stop)
+    return index, min(left, index), max(right, index + 1)
+
+
+@extraction_step(
+    "energy",
+    title="Energies",
+    after=("detachment", "pull-off"),
+    gives={
+        "adhesion_energy_J": "work of the tension from z_r = 0 to detachment",
+        "energy_to_main_jump_J": "part of it up to the largest jump",
+        "energy_after_main_jump_J": "part of it after the largest jump",
+        "energy_to_pull_off_J": "part of it up to F_p",
+    },
+)
+def energy(work: Extraction) -> Details:
+    """Integrate -F_r over the separation by the trapezoidal rule, from the zero of force to detachment, split at the largest jump."""
+    jump = max(work.jumps, key=lambda j: abs(j.size), default=None)
+    split = min(jump.middle, work.release) if jump is not None else work.release
+    first, last = int(np.ceil(work.zero)), int(np.floor(work.release))
+    total, to_split, to_peak = (
+        _work(work, first, stop) for stop in (last, int(np.floor(split)), int(np.floor(work.peak)))
+    )
+    work.set(
+        adhesion_energy_J=total,
+        energy_to_main_jump_J=to_split,
+        energy_after_main_jump_J=total - to_split,
+        energy_to_pull_off_J=to_peak,
+    )
+    return {"decision": "split at the largest jump" if jump is not None else "no jump to split at", "split": split}
+
+
+def _work(work: Extraction, first: int, last: int) -> float:
+    part = slice(first, last + 1)
+    return -float(np.trapezoid(work.force[part], work.separation[part]))
+
+
+@extraction_step(
+    "hysteresis",
+    title="Hysteresis loop",
+    after=("energy",),
+    gives={"hysteresis_energy_J": "work done on the sample in the whole cycle, contact to detachment"},
+)
+def hysteresis(work: Extraction) -> Details:
+    """Integrate -F_r over the separation around the loop: approach from contact, preload, dwell, retraction to detachment.
+
+    What the gas and the pump put in during the cycle is part of it.
+    """
+    if work.windows.approach is None:
+        raise FeatureMissing("the run has no approach")
+    total = _work(work, work.contact_start, int(np.floor(work.release)))
+    work.set(hysteresis_energy_J=total)
+    return {"decision": "from contact to detachment", "window": (work.contact_start, work.release)}
+
+
+@extraction_step(
+    "pressure",
+    title="Pressure",
+    after=("segments",),
+    uses=("pull-off", "detachment"),
+    gives={
+        "initial_pressure_Pa": "P_0: P_a at the start of the retraction",
+        "pressure_noise_Pa": "standard deviation of one pressure sample",
+        "pressure_at_pull_off_Pa": "P_a at F_p",
+        "pressure_at_detachment_Pa": "P_a just before detachment",
+    },
+)
+def pressure(work: Extraction) -> Details:
+    """P_0 is a line through the last half second before the retraction, taken at its start; the others are 100 ms means."""
+    signal = work.run.pressure
+    if signal is None:
+        raise FeatureMissing("the scene has no pressure")
+    start, _ = work.retraction()
+    length = max(8, round(0.5 * work.run.rate))
+    window = (max(0, start - length), start) if start > 16 else (start, start + length)
+    places = np.arange(*window, dtype=np.float64)
+    line = np.polynomial.Polynomial.fit(places, signal[slice(*window)], 1)
+    residual = np.asarray(signal[slice(*window)] - line(places), dtype=np.float64)
+    work.set(initial_pressure_Pa=float(line(start)), pressure_noise_Pa=float(residual.std()))
+    half = max(1, round(0.05 * work.run.rate))
+    for name, index in (("pull_off", getattr(work, "peak", None)), ("detachment", getattr(work, "release", None))):
+        if index is None:
+            work.missing[f"pressure_at_{name}_Pa"] = f"no {name.replace('_', '-')}"
+        elif name == "detachment":
+            work.values[f"pressure_at_{name}_Pa"] = _before(signal, int(index), half)
+        else:
+            work.values[f"pressure_at_{name}_Pa"] = float(signal[int(index) - half : int(index) + half].mean())
+    return {"decision": f"line over {length / work.run.rate:.2g} s before the retraction", "window": window}
+
+
+def _before(signal: Array, index: int, half: int) -> float:
+    return float(signal[max(0, index - 2 * half) : max(1, index)].mean())
+
+
+@extraction_step(
+    "gas work",
+    title="Work of the gas",
+    after=("pressure",),
+    gives={
+        "pump_work_J": "work of the pump on the gas while P_0 is set, p dV",
+        "gas_work_J": "work of the gas on the membrane in the retraction, p dV",
+    },
+)
+def gas_work(work: Extraction) -> Details:
+    """Integrate P_a dV with the volume from Boyle's law and V_0: V = (P_atm + P_0) V_0 / (P_atm + P_a).
+
+    The pump's part uses the recorded pump volume where there is one, and Boyle's law with V_0 otherwise.
+    """
+    run = work.run
+    if run.parameters is None or run.pressure is None:
+        raise FeatureMissing("without parameters the chamber volume is unknown")
+    atmosphere, volume = run.parameters.gas.atmospheric_pressure, run.parameters.gripper.chamber_volume
+    reason = "the run has no pressurize step"
+    if work.windows.pressurize is not None:
+        part = slice(*work.windows.pressurize)
+        if run.pump_volume is not None:
+            work.set(pump_work_J=float(np.trapezoid(run.pressure[part], run.pump_volume[part])))
+        else:
+            width = max(1, round(SMOOTHING * run.rate))
+            gas = running_mean(run.pressure[part], width)
+            work.set(pump_work_J=float(np.trapezoid(gas, volume * (gas - gas[0]) / (atmosphere + gas))))
+    else:
+        work.missing["pump_work_J"] = reason
+    start, stop = work.retraction()
+    last = int(getattr(work, "release", stop - 1))
+    gas = running_mean(run.pressure[start : last + 1], max(1, round(SMOOTHING * run.rate)))
+    work.set(gas_work_J=float(np.trapezoid(gas, volume * (atmosphere + gas[0]) / (atmosphere + gas))))
+    return {"decision": "pump volume recorded" if run.pump_volume is not None else "volume from Boyle's law"}
+
+
+@extraction_step(
+    "stress",
+    title="Stress",
+    after=("pull-off",),
+    gives={"adhesion_stress_Pa": "F_p over the full contact pi r_e^2 (large spheres and flats)"},
+)
+def stress(work: Extraction) -> Details:
+    """Divide F_p by the contact area; known only where the contact is full: flats, and spheres that the rim fits around.
+
+    The papers use r_e = 7.3 mm there (1.67 cm^2); on smaller spheres the area could not be seen.
+    """
+    parameters = work.run.parameters
+    if parameters is None:
+        raise FeatureMissing("without parameters the contact area is unknown")
+    gripper = parameters.gripper
+    if parameters.substrate.radius < 3 * gripper.radius:
+        raise FeatureMissing("the contact area on so small a sphere is unknown")
+    radius = min(gripper.effective_radius, (parameters.substrate.diameter or np.inf) / 2)
+    work.set(adhesion_stress_Pa=work.values["pull_off_force_N"] / (np.pi * radius**2))
+    return {"decision": f"A_c = {np.pi * radius**2 * 1e4:.3f} cm²"}
+
+
+def noise_of(signal: Array, memory: int) -> Noise:
+    """Measure the noise of a slowly varying signal from its second differences."""
+    return Noise.measure(np.asarray(np.diff(signal, 2) / np.sqrt(6.0), dtype=np.float64), memory)
