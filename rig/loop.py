@@ -17,7 +17,6 @@ from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage, StageStatus
 from rig.errors import Interlock, StoppedByOperator
 from rig.interlocks import Interlocks
 from rig.observe import Controls, Event, Observer, StepEvent, StepPhase, Wish
-from rig.recorder import Recorder
 from rig.timebase import TimeBase
 from sequences.frame import Frame
 
@@ -41,6 +40,26 @@ class Converter(Protocol):
         ...
 
 
+class Store(Protocol):
+    """Where a run is kept: the recorder, or in a replay what holds it against the recording."""
+
+    def append(self, frame: Frame, height: Array, arrived: float) -> None:
+        """Take a frame."""
+        ...
+
+    def step(self, event: StepEvent) -> None:
+        """Take the beginning or the end of a step."""
+        ...
+
+    def event(self, event: Event) -> None:
+        """Take a line of the log."""
+        ...
+
+    def prediction(self, sample: int, text: str) -> None:
+        """Take a live prediction as JSON."""
+        ...
+
+
 @dataclass(frozen=True)
 class Instruments:
     """What a run has open. ``pump`` is ``None`` in a scene without pressure."""
@@ -52,10 +71,10 @@ class Instruments:
 
 
 class Reporter:
-    """Carries steps, events and predictions to recorder and observers. A failing observer is dropped, loudly."""
+    """Carries steps, events and predictions to store and observers. A failing observer is dropped, loudly."""
 
-    def __init__(self, recorder: Recorder | None, observers: Iterable[Observer]) -> None:
-        self._recorder = recorder
+    def __init__(self, store: Store | None, observers: Iterable[Observer]) -> None:
+        self._store = store
         self._observers = list(observers)
         self._step = ""
         self._frames = 0
@@ -88,14 +107,14 @@ class Reporter:
     def event(self, kind: str, text: str) -> None:
         """A line for the log."""
         event = Event(self.sample, kind, text)
-        if self._recorder is not None:
-            self._recorder.event(event)
+        if self._store is not None:
+            self._store.event(event)
         self.notify("event", event)
 
     def prediction(self, prediction: Any, text: str) -> None:
         """A live prediction, and its form in the recording."""
-        if self._recorder is not None:
-            self._recorder.prediction(self.sample, text)
+        if self._store is not None:
+            self._store.prediction(self.sample, text)
         self.notify("prediction", prediction)
 
     def notify(self, what: str, subject: Any) -> None:
@@ -108,8 +127,8 @@ class Reporter:
                 self.event("warning", f"observer {type(observer).__name__} failed and was dropped: {error!r}")
 
     def _tell(self, event: StepEvent) -> None:
-        if self._recorder is not None:
-            self._recorder.step(event)
+        if self._store is not None:
+            self._store.step(event)
         self.notify("step", event)
 
 
@@ -129,7 +148,7 @@ class Loop:
         instruments: Instruments,
         converter: Converter,
         interlocks: Interlocks,
-        recorder: Recorder | None,
+        store: Store | None,
         reporter: Reporter,
         controls: Controls,
         *,
@@ -139,7 +158,7 @@ class Loop:
         self._instruments = instruments
         self._converter = converter
         self._interlocks = interlocks
-        self._recorder = recorder
+        self._store = store
         self._reporter = reporter
         self._controls = controls
         self._frame_samples = frame_samples
@@ -180,7 +199,7 @@ class Loop:
         stage, daq, clock = self._instruments.stage, self._instruments.daq, self._instruments.clock
         self._stage_status = stage.status()
         daq.start()
-        timebase = TimeBase(daq.rate, self._stage_status)
+        timebase = TimeBase(daq.rate)
         number = 0
         while True:
             volts = daq.read(self._frame_samples)
@@ -218,8 +237,8 @@ class Loop:
         self._interlocks.check_motion(frame.stage, timebase.lag(frame.stop, arrived))
 
     def _record(self, frame: Frame, height: Array, arrived: float) -> None:
-        if self._recorder is not None:
-            self._recorder.append(frame, height, arrived)
+        if self._store is not None:
+            self._store.append(frame, height, arrived)
         self.samples = self._reporter.sample = frame.stop
 
     def _poll_pump(self, number: int) -> PumpStatus | None:

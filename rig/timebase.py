@@ -22,10 +22,10 @@ class TimeBase:
     Everything follows from the arguments of ``place``, so that a replay gives the same numbers to the bit.
     """
 
-    def __init__(self, rate: float, first: StageStatus) -> None:
+    def __init__(self, rate: float) -> None:
         self._rate = rate
         self._offsets: deque[float] = deque(maxlen=WINDOW_FRAMES)
-        self._last = _point(first)
+        self._last: tuple[float, float] | None = None
 
     @property
     def offset(self) -> float:
@@ -33,11 +33,15 @@ class TimeBase:
         return min(self._offsets)
 
     def place(self, start: int, count: int, arrived: float, stage: StageStatus) -> NDArray[np.float64]:
-        """Return the stage's position at each sample of a frame, m, linear between this poll and the one before."""
+        """Return the stage's position at each sample of a frame, m, linear between the poll before and this one.
+
+        In the first frame it is this poll's position.
+        """
         self._offsets.append(arrived - (start + count) / self._rate)
         now = _point(stage)
         times = self.offset + np.arange(start, start + count) / self._rate
-        height = np.interp(times, (self._last[0], now[0]), (self._last[1], now[1]))
+        last = self._last or now
+        height = np.interp(times, (last[0], now[0]), (last[1], now[1]))
         self._last = now
         return height
 
