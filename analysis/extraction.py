@@ -1,7 +1,8 @@
 """The registry of extraction steps and the state they share.
 
-A step is one function: it reads what earlier steps found, decides something, stores the numbers it ``gives`` and returns the
-``details`` that show *why* it decided so; the overview picture and the report draw them. Adding a feature is adding one function:
+A step is one function: it reads what earlier steps found, decides something, stores the numbers it ``gives`` and
+returns the ``details`` that show *why* it decided so; the overview picture and the report draw them. Adding a feature
+is adding one function:
 
     @extraction_step("pull-off", title="Pull-off force", after=("tare",), gives={"pull_off_force_N": "largest tension"})
     def pull_off(work: Extraction) -> Details: ...
@@ -24,7 +25,7 @@ Details = Mapping[str, object]
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Sample ranges of one run, from the step events: (start, stop), stop exclusive; ``None`` where the run has no such part."""
+    """Sample ranges of one run, (start, stop), stop exclusive; ``None`` where the run has no such part."""
 
     free: tuple[int, int]
     approach: tuple[int, int] | None

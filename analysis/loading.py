@@ -51,7 +51,8 @@ def constant_and_polynomial(depth: Array, force: Array, sigma: float) -> int:
     """Piecewise fit.
 
     1. Use the curve up to the first fifth of its largest force.
-    2. For each candidate, force is zero before and a x + b x^2 with x the depth beyond the candidate; a, b by least squares.
+    2. For each candidate, force is zero before and a x + b x^2 with x the depth beyond the candidate; a, b by least
+       squares.
     3. The candidate with the smallest sum of squares is the contact.
     """
     del sigma
@@ -83,7 +84,8 @@ def gradient(depth: Array, force: Array, sigma: float) -> int:
     """Gradient crossing.
 
     1. The gradient of the force, averaged over one fortieth of the curve.
-    2. Going back from the first tenth of the largest gradient, the point where the gradient falls to what noise alone would give.
+    2. Going back from the first tenth of the largest gradient, the point where the gradient falls to what noise alone
+       would give.
     """
     width = max(3, force.size // 40)
     slope = np.gradient(running_mean(force, width), depth)
@@ -122,7 +124,7 @@ def direct_path(depth: Array, force: Array, sigma: float) -> int:
     },
 )
 def contact(work: Extraction) -> Details:
-    """Find the contact point by every registered method on the same approach curve; the median counts, the spread is reported."""
+    """Find the contact by every registered method on the same curve; the median counts, the spread is reported."""
     depth, force, first = _approach_curve(work)
     sigma = work.noise.of_mean((work.windows.approach[1] - first) / force.size) if work.windows.approach else 0.0
     found = {name: -float(depth[method(depth, force, sigma)]) for name, (_, method) in CONTACT_METHODS.items()}
@@ -133,7 +135,7 @@ def contact(work: Extraction) -> Details:
 
 
 def _approach_curve(work: Extraction) -> tuple[Array, Array, int]:
-    """Return depth (rising), force, and the first sample used: the moving part of the approach, averaged into blocks."""
+    """Return depth (rising) and force of the moving part of the approach, in blocks, and its first sample."""
     if work.windows.approach is None:
         raise FeatureMissing("the run has no approach")
     start, stop = work.windows.approach

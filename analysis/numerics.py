@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 BLOCKS = 48
-"""Samples of a window are averaged into at most this many blocks before a fit: fast, and it makes the test of fit sharp."""
+"""A window is averaged into about this many blocks before a fit: fast, and it makes the test of fit sharp."""
 
 
 def running_mean(values: Array, width: int) -> Array:
@@ -23,7 +23,7 @@ def running_mean(values: Array, width: int) -> Array:
 def block_means(values: Array, length: int) -> Array:
     """Means of consecutive blocks of ``length`` samples; an incomplete last block is left out."""
     count = values.size // length
-    return values[: count * length].reshape(count, length).mean(axis=1)
+    return np.asarray(values[: count * length].reshape(count, length).mean(axis=1), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ class Noise:
         starts = generator.integers(0, self.residual.size - block + 1, pieces)
         signs = generator.choice(np.array([-1.0, 1.0]), pieces)
         drawn = self.residual[starts[:, None] + np.arange(block)] * signs[:, None]
-        return drawn.reshape(-1)[:count]
+        return np.asarray(drawn.reshape(-1)[:count], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,7 @@ class LocalFit:
     stop: int
 
     def __call__(self, index: float) -> float:
+        """Return the value at a sample index, which may lie between two samples."""
         return float(self.polynomial(index))
 
     def slope(self, index: float) -> float:

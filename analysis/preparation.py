@@ -20,8 +20,9 @@ NOISE_MEMORY = 0.1
 def segments(work: Extraction) -> Details:
     """Take the segments from the recorded step events, and check them against the data.
 
-    The retraction runs from the start of ``retract`` to the end of ``pull-off``. Without ``tare`` the first part of the approach
-    serves as force-free. Checks: the stage rises in the retraction, falls in the approach, and rests in the dwell.
+    The retraction runs from the start of ``retract`` to the end of ``pull-off``. Without ``tare`` the first part of
+    the approach serves as force-free. Checks: the stage rises in the retraction, falls in the approach, and rests in
+    the dwell.
     """
     run = work.run
     if run.force.size < 16:
@@ -84,10 +85,10 @@ def _moves(height: Array, window: tuple[int, int] | None, direction: int) -> boo
 def tare(work: Extraction) -> Details:
     """Fit one straight line in time to all force-free samples: tare, approach before contact, and after detachment.
 
-    1. Level and noise from the tare. Going back from the end of the approach, contact begins after the last sample whose running
-       mean lies within five standard deviations of that level; a margin before it is left out.
-    2. The sample has come off when the force ends within a quarter of the largest tension from the level; detachment is the last
-       crossing of three per cent of it.
+    1. Level and noise from the tare. Going back from the end of the approach, contact begins after the last sample
+       whose running mean lies within five standard deviations of that level; a margin before it is left out.
+    2. The sample has come off when the force ends within a quarter of the largest tension from the level; detachment
+       is the last crossing of three per cent of it.
     3. Block means before contact and after detachment, equally weighted, give level and drift by least squares.
     """
     run = work.run
@@ -157,7 +158,7 @@ def _after_detachment(work: Extraction, margin: int) -> tuple[int, int] | None:
 
 
 def _fit_line(force: Array, windows: list[tuple[int, int]]) -> np.polynomial.Polynomial:
-    """Least squares over block means; every part of the record counts by its length, a short record is only levelled."""
+    """Least squares over block means; every part of the record counts by its length."""
     places, means = [], []
     for start, stop in windows:
         length = max(1, (stop - start) // 200)

@@ -1,7 +1,8 @@
 """Uncertainty from calibration, noise, drift, contact point and sampling, carried to every number.
 
-The whole extraction is repeated on perturbed copies of the run: once per systematic source (its effect is taken as linear), and on
-``DRAWS`` copies with fresh noise resampled from the force-free part of the record. Seeds are fixed: re-running gives the same digits.
+The whole extraction is repeated on perturbed copies of the run: once per systematic source (its effect is taken as
+linear), and on ``DRAWS`` copies with fresh noise resampled from the force-free part of the record. Seeds are fixed:
+re-running gives the same digits.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def _bent(work: Extraction, uncertainty: float) -> Array:
 
 
 def _drift_excess(work: Extraction) -> float:
-    """How far the zero may have wandered from the fitted line in contact: what its force-free parts show beyond their noise."""
+    """How far the zero may have wandered from the line in contact: what its force-free parts show beyond noise."""
     windows = work.details["tare"]["windows"]
     assert isinstance(windows, list)
     excess = 0.0
@@ -128,7 +129,7 @@ def _pressure_noise(work: Extraction) -> Noise | None:
 
 
 def _sampling(work: Extraction) -> dict[str, float]:
-    """Return what the finite sample rate adds: the instant of a jump is known to within its samples, a peak to within its bias."""
+    """Return what the finite sample rate adds: a jump is known to within its samples, a peak to within its bias."""
     found: dict[str, float] = {}
     values = work.values
     if "pull_off_distance_m" in values:

@@ -90,7 +90,7 @@ class Features(Mapping[str, Quantity]):
         return self._found[name].uncertainty if name in self._found else math.nan
 
     def as_json(self) -> dict[str, Any]:
-        """Return values by name, then ``uncertainty``, ``budget`` and ``missing``; numbers that are not finite are null."""
+        """Return values by name, then ``uncertainty``, ``budget`` and ``missing``; no finite number is null."""
         return {
             **{name: finite(quantity.value) for name, quantity in self.items()},
             "uncertainty": {name: finite(quantity.uncertainty) for name, quantity in self.items()},

@@ -23,8 +23,8 @@ def zero_crossing(work: Extraction) -> Details:
     """Find the last crossing from compression to tension before the largest tension.
 
     1. A running mean of 20 ms brackets the crossing.
-    2. A cubic is fitted around it, up to a tenth of the retraction either way, in the widest window whose residuals are noise;
-       its root is the zero.
+    2. A cubic is fitted around it, up to a tenth of the retraction either way, in the widest window whose residuals
+       are noise; its root is the zero.
     3. Force that is tensile from the start (suction on a flat) has its zero of z_r at the start of the retraction.
     """
     require_adhesion(work)
@@ -78,7 +78,7 @@ def _slope(signal: Array, index: int, reach: int) -> float:
     },
 )
 def jumps(work: Extraction) -> Details:
-    """Find sudden changes: means over 20 ms before and after differ by six standard deviations and one per cent of the tension.
+    """Find where means over 20 ms before and after differ by six standard deviations and one per cent of the tension.
 
     A line fitted on either side of each candidate must confirm it, so that steep but smooth stretches do not count.
     """
@@ -109,8 +109,8 @@ def jumps(work: Extraction) -> Details:
 def detachment(work: Extraction) -> Details:
     """Detachment is the last jump that releases the tension for good; half-way through it.
 
-    Without such a jump: where the tension, fitted by a line over its last part, falls below four standard deviations of a 20 ms mean.
-    The separation is the stage's height then, corrected by the compliance for the force just before.
+    Without such a jump: where the tension, fitted by a line over its last part, falls below four standard deviations
+    of a 20 ms mean. The separation is the stage's height then, corrected by the compliance for the force just before.
     """
     start, stop = work.retraction()
     width = max(4, round(SMOOTHING * work.run.rate))
@@ -155,8 +155,8 @@ def detachment(work: Extraction) -> Details:
 def pull_off(work: Extraction) -> Details:
     """Fit a cubic around the largest tension, in the widest window whose residuals are noise, but never across a jump.
 
-    Where the peak lies at a jump, the force was still growing when the contact let go: on average half a sample's growth is missed.
-    A smooth peak misses curvature dt^2 / 24.
+    Where the peak lies at a jump, the force was still growing when the contact let go: on average half a sample's
+    growth is missed. A smooth peak misses curvature dt^2 / 24.
     """
     start, stop = work.retraction()
     left, right = max(start, int(np.floor(work.zero))), min(stop, work.windows.end)
@@ -206,7 +206,7 @@ def _side_of_jump(work: Extraction, index: int, left: int, right: int) -> tuple[
     },
 )
 def energy(work: Extraction) -> Details:
-    """Integrate -F_r over the separation by the trapezoidal rule, from the zero of force to detachment, split at the largest jump."""
+    """Integrate -F_r over the separation (trapezoids) from z_r = 0 to detachment, split at the largest jump."""
     jump = max(work.jumps, key=lambda j: abs(j.size), default=None)
     split = min(jump.middle, work.release) if jump is not None else work.release
     first, last = int(np.ceil(work.zero)), int(np.floor(work.release))
@@ -234,7 +234,7 @@ def _work(work: Extraction, first: int, last: int) -> float:
     gives={"hysteresis_energy_J": "work done on the sample in the whole cycle, contact to detachment"},
 )
 def hysteresis(work: Extraction) -> Details:
-    """Integrate -F_r over the separation around the loop: approach from contact, preload, dwell, retraction to detachment.
+    """Integrate -F_r over the separation around the loop: from contact over preload and dwell to detachment.
 
     What the gas and the pump put in during the cycle is part of it.
     """
@@ -258,7 +258,7 @@ def hysteresis(work: Extraction) -> Details:
     },
 )
 def pressure(work: Extraction) -> Details:
-    """P_0 is a line through the last half second before the retraction, taken at its start; the others are 100 ms means."""
+    """P_0 is a line through the last half second before the retraction, at its start; the others are 100 ms means."""
     signal = work.run.pressure
     if signal is None:
         raise FeatureMissing("the scene has no pressure")
@@ -327,7 +327,7 @@ def gas_work(work: Extraction) -> Details:
     gives={"adhesion_stress_Pa": "F_p over the full contact pi r_e^2 (large spheres and flats)"},
 )
 def stress(work: Extraction) -> Details:
-    """Divide F_p by the contact area; known only where the contact is full: flats, and spheres that the rim fits around.
+    """Divide F_p by the contact area, known only where the contact is full: flats and large spheres.
 
     The papers use r_e = 7.3 mm there (1.67 cm^2); on smaller spheres the area could not be seen.
     """

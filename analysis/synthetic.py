@@ -1,4 +1,4 @@
-"""Runs with known truth: a profile put through stage, load train, sensors and noise. For checks of the analysis itself."""
+"""Runs with known truth: a profile put through stage, load train, sensors and noise. They check the analysis."""
 
 from __future__ import annotations
 
