@@ -6,6 +6,7 @@ the plant tells the script its sample count, and the run tells it which step has
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -90,6 +91,23 @@ class Faults:
                     return fault
         return None
 
+    def during(self, device: str, kind: str, start: int, stop: int) -> list[tuple[int, int, Fault]]:
+        """Return (first, last + 1, fault) of every fault of this kind that touches samples ``start`` to ``stop - 1``.
+
+        Exact to the sample, whatever blocks the samples are produced in.
+        """
+        if not self._starts:
+            return []
+        with self._lock:
+            spans = [
+                (max(start, begin), min(stop, self._end(begin, fault)), fault)
+                for begin, fault in self._starts
+                if (fault.device, fault.kind) == (device, kind)
+            ]
+        return [(first, last, fault) for first, last, fault in spans if first < last]
+
+    def _end(self, start: int, fault: Fault) -> int:
+        return sys.maxsize if fault.for_samples is None else start + fault.for_samples
+
     def _has_begun(self, start: int, fault: Fault) -> bool:
-        end = float("inf") if fault.for_samples is None else start + fault.for_samples
-        return start <= self._sample < end
+        return start <= self._sample < self._end(start, fault)
