@@ -1,0 +1,309 @@
+"""The true membrane of the emulated world: it bulges, sticks, peels at a rate, and is not the overlay's cone.
+
+Between contact line and rim the meridian is a straight line plus a parabolic bulge in equilibrium with the gas
+(a two-parameter Ritz shape); the material is neo-Hookean without hoop stretch. The energy release rate is the
+derivative of that potential with respect to the contact area. The contact line
+
+- recedes when the release rate exceeds ``receding``, at a rate that grows with the excess (a power law, as
+  polymers peel), and runs away where no equilibrium is left;
+- advances when the release rate of zipping falls below ``advancing``, or where the film would enter the substrate;
+- otherwise stays pinned. The two energies differ: adhesion hysteresis.
+
+Beside the contact, the film-covered rim of the gripper touches the substrate, slightly tilted, and takes the preload.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from drivers.emulated.chamber import ATMOSPHERE, Chamber
+from drivers.emulated.specimens import RADIUS_TOLERANCE, State, finish
+
+FREE_DEFLECTION = 0.59488
+"""Pole of a clamped, inflated membrane over R_0 (p R_0 / E h)^(1/3), Poisson's ratio 1/2 (Hencky)."""
+
+FREE_VOLUME = 0.965163
+"""Its volume over R_0^3 (p R_0 / E h)^(1/3)."""
+
+SEED_RADIUS = 60e-6
+"""A contact begins and ends at this radius, about one fibre, m."""
+
+FASTEST = 5.0
+"""Contact lines do not outrun this, m/s."""
+
+PRESSURE_STEP = 5.0
+"""Newton's correction (Pa) below which the remaining error is far under the sensor's noise."""
+
+HEIGHT_STEP = 5e-8
+"""The same for the height, m."""
+
+ITERATIONS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class AdhesiveMembrane:
+    """A fibrillar adhesive membrane on a rigid gripper above a sphere, a flat, or a flat disk.
+
+    Attributes
+    ----------
+    substrate_diameter
+        Of the sphere, m; ``None`` is a flat.
+    disk_diameter
+        Of a flat disk, m; ``None`` is wider than the gripper.
+    radius, effective_radius
+        R_0 and the largest contact radius misalignment and imperfections allow, m.
+    youngs_modulus, thickness, prestretch
+        Pa, m, strain the film was mounted with.
+    receding, advancing
+        Work of adhesion at zero speed of a receding and an advancing line, J/m^2.
+    line_speed, rate_exponent
+        w = receding (1 + (v / line_speed)^rate_exponent), m/s.
+    advancing_speed
+        Largest speed of an advancing line, m/s.
+    contact_strain
+        The film laid on a sphere stores E h a^4 / (contact_strain r_b^4) per area.
+    rim_stiffness, tilt
+        N/m of the fully seated rim; angle between rim and substrate, rad.
+    """
+
+    substrate_diameter: float | None = 60e-3
+    disk_diameter: float | None = None
+    radius: float = 8e-3
+    effective_radius: float = 7.3e-3
+    youngs_modulus: float = 2.08e6
+    thickness: float = 196e-6
+    prestretch: float = 2e-3
+    receding: float = 3.7
+    advancing: float = 0.2
+    line_speed: float = 1.0
+    rate_exponent: float = 0.35
+    advancing_speed: float = 0.05
+    contact_strain: float = 270.0
+    rim_stiffness: float = 60e3
+    tilt: float = 1e-3
+
+    def step(
+        self,
+        state: State,
+        duration: float,
+        height: float,
+        delivered: float,
+        amount: float,
+        chamber: Chamber,
+        stiffness: float,
+    ) -> State:
+        """Move the contact line, then balance film, gas and load train."""
+        world = (height, delivered, amount, chamber, stiffness)
+        if state.radius == 0.0:
+            return self._step_free(state, duration, *world)
+        radius = min(state.radius + state.speed * duration, self.largest_radius)
+        if radius < SEED_RADIUS:
+            return self._step_free(state, duration, *world)
+        after = self._balance(state, radius, *world)
+        slip = 0.0
+        if after[4] != state.speed:
+            better = min(state.radius + 0.5 * (state.speed + after[4]) * duration, self.largest_radius)
+            slip = abs(better - radius) / (RADIUS_TOLERANCE + 0.05 * abs(radius - state.radius))
+            if slip > 0.1 and better > SEED_RADIUS:
+                after = self._balance(state, better, *world)
+        return finish(state, duration, *after, slip)
+
+    @property
+    def largest_radius(self) -> float:
+        """Largest possible contact radius, m."""
+        if self.disk_diameter is not None:
+            return min(self.effective_radius, self.disk_diameter / 2)
+        if self.substrate_diameter is not None:
+            return min(self.effective_radius, 0.49 * self.substrate_diameter)
+        return self.effective_radius
+
+    @property
+    def seat(self) -> float:
+        """Height at which the untilted rim touches, m; far below everything where it never does."""
+        if self.substrate_diameter is not None:
+            sphere = self.substrate_diameter / 2
+            if sphere <= self.radius:
+                return -2 * sphere
+            return -sphere + math.sqrt(sphere**2 - self.radius**2)
+        return -math.inf if self.disk_diameter is not None and self.disk_diameter < 2 * self.radius else 0.0
+
+    def rim(self, height: float) -> tuple[float, float]:
+        """Force (N) of the rim on the substrate and its stiffness (N/m): a tilted ring touches on one side first."""
+        depth = self.seat - height
+        lift = self.tilt * self.radius
+        if depth <= -lift:
+            return 0.0, 0.0
+        if depth >= lift:
+            return self.rim_stiffness * depth, self.rim_stiffness
+        seated = math.acos(-depth / lift)
+        force = self.rim_stiffness * (math.sqrt(lift * lift - depth * depth) + depth * seated) / math.pi
+        return force, self.rim_stiffness * seated / math.pi
+
+    def _step_free(
+        self,
+        state: State,
+        duration: float,
+        height: float,
+        delivered: float,
+        amount: float,
+        chamber: Chamber,
+        stiffness: float,
+    ) -> State:
+        """Out of contact the film is a clamped membrane inflated by the gas; it may touch at the end."""
+        inflation = 0.0 if chamber.vented else self._inflate(state, delivered, amount, chamber)
+        pressure = 0.0 if chamber.vented else self._film / self.radius * inflation**3
+        if height < FREE_DEFLECTION * self.radius * inflation:
+            touching = self._balance(
+                State(pressure=pressure, height=height), SEED_RADIUS, height, delivered, amount, chamber, stiffness
+            )
+            if touching[4] >= 0.0:
+                return finish(state, duration, *touching)
+        force, height = self._seated(height, stiffness)
+        return finish(state, duration, force, pressure, height, 0.0, 0.0, inflation)
+
+    def _inflate(self, state: State, delivered: float, amount: float, chamber: Chamber) -> float:
+        """Cube root of p R_0 / (E h) of the free film with this much gas behind it."""
+        film = self._film / self.radius
+        swept = FREE_VOLUME * self.radius**3
+        inflation = state.stretch if state.radius == 0.0 else math.cbrt(state.pressure / film)
+        for _ in range(ITERATIONS):
+            change = swept * inflation - delivered
+            pressure = chamber.pressure(amount, change)
+            slope = 3 * film * inflation * inflation + (pressure + ATMOSPHERE) / (chamber.volume + change) * swept
+            correction = (pressure - film * inflation**3) / slope
+            inflation += correction
+            if abs(correction) < 1e-9:
+                return inflation
+        raise ArithmeticError(f"free membrane: no equilibrium with {delivered:g} m^3 delivered, amount {amount:g}")
+
+    def _seated(self, height: float, stiffness: float) -> tuple[float, float]:
+        """Force and height when only the rim may touch."""
+        force = 0.0
+        loaded = height
+        for _ in range(ITERATIONS):
+            force, slope = self.rim(loaded)
+            correction = (height + force / stiffness - loaded) / (1 + slope / stiffness)
+            loaded += correction
+            if abs(correction) < HEIGHT_STEP:
+                break
+        return force, loaded
+
+    @property
+    def _film(self) -> float:
+        return self.youngs_modulus * self.thickness
+
+    def _laid_on(self, a: float) -> tuple[float, float, float, float]:
+        """Height, edge slope and volume of the cap of radius ``a``, and the energy (J/m^2) of laying film at its edge."""
+        if self.substrate_diameter is None:
+            return 0.0, 0.0, 0.0, 0.0
+        sphere = 0.5 * self.substrate_diameter
+        below = math.sqrt(sphere * sphere - a * a)
+        cap = a * a / (sphere + below)
+        laid = 3 * self._film * (a / sphere) ** 4 / self.contact_strain
+        return cap, a / below, math.pi * cap / 6 * (3 * a * a + cap * cap), laid
+
+    def _balance(
+        self,
+        state: State,
+        radius: float,
+        height: float,
+        delivered: float,
+        amount: float,
+        chamber: Chamber,
+        stiffness: float,
+    ) -> tuple[float, float, float, float, float, float]:
+        """Balance film, gas and load train at a given contact radius (Newton in height and pressure).
+
+        Returns force, pressure, height, radius, speed of the line, stretch.
+        """
+        pi = math.pi
+        a, R = radius, self.radius
+        film = self._film
+        cap, cap_slope, cap_volume, laid = self._laid_on(a)
+        L = R - a
+        ring = pi * (R * R - a * a)
+        cone = pi / 3 * (R * R + a * a + R * a)
+        energy = film / 6
+        base = self.prestretch * (2 + self.prestretch)
+        vented = chamber.vented
+        y, z, p = state.stretch, state.height, state.pressure
+        if state.radius == 0.0:
+            y = base
+        for _ in range(ITERATIONS):
+            d = z + cap
+            inclined = base + (d / L) ** 2
+            load = p * L / film
+            swelling = 0.75 * load * load
+            y, x, xy = _stretch(y, inclined, swelling)
+            b = -0.375 * load * L / x
+            give = x * x + 2 * (y - inclined) * x * xy
+            b_p = -0.375 * L * L / (film * x) * (1 - 2 * xy * swelling / (x * give))
+            force_z = -ring * energy * 2 / (L * L) * (x + 2 * xy * d * d / (L * L))
+            rim, rim_stiffness = self.rim(z)
+            force = p * cone - ring * energy * x * 2 * d / (L * L) + rim
+            change = cone * d - cap_volume - 2 / 3 * ring * b - delivered
+            r_z = height + force / stiffness - z
+            if vented:
+                dp = 0.0
+                dz = r_z / (1 - (force_z - rim_stiffness) / stiffness)
+            else:
+                gas = chamber.pressure(amount, change)
+                kappa = (gas + ATMOSPHERE) / (chamber.volume + change)
+                m11 = 1 - kappa * 2 / 3 * ring * b_p
+                m12 = kappa * cone
+                m21 = -cone / stiffness
+                m22 = 1 - (force_z - rim_stiffness) / stiffness
+                r_p = gas - p
+                determinant = m11 * m22 - m12 * m21
+                dp = (r_p * m22 - m12 * r_z) / determinant
+                dz = (m11 * r_z - m21 * r_p) / determinant
+            z += dz
+            p += dp
+            if -HEIGHT_STEP < dz < HEIGHT_STEP and -PRESSURE_STEP < dp < PRESSURE_STEP:
+                break
+        else:
+            raise ArithmeticError(f"membrane: no equilibrium at a = {a:g} m, height {height:g} m, pressure {p:g} Pa")
+        opened = d * d + 16 / 3 * b * b
+        release = (
+            energy * (x * (R + a) / (a * L) * (d * cap_slope + opened / L) - (_density(y) - _density(base)))
+            + laid
+            - p * ((cap_slope * cone + pi / 3 * d * (2 * a + R)) / (2 * pi * a) - 0.5 * a * cap_slope + 2 / 3 * b)
+        )
+        speed = self._line_speed(a, release, (d + 4 * b) / L + cap_slope, energy * x * math.sqrt(1 + y))
+        return stiffness * (z - height), p, z, a, speed, y
+
+    def _line_speed(self, radius: float, release: float, angle: float, tension: float) -> float:
+        """Speed of the contact line from the energy release rate, and from the angle at which film would zip."""
+        excess = release / self.receding - 1
+        if excess > 0.0:
+            return -min(self.line_speed * math.pow(excess, 1 / self.rate_exponent), FASTEST)
+        if radius >= self.largest_radius:
+            return 0.0
+        lack = 1 - tension * angle * abs(angle) / self.advancing
+        if lack <= 0.0:
+            return 0.0
+        return self.advancing_speed * (1.0 if lack >= 1.0 else math.pow(lack, 1 / self.rate_exponent))
+
+
+def _density(y: float) -> float:
+    """Neo-Hookean energy over E / 6 at a squared stretch of 1 + y, no hoop stretch."""
+    return y * y / (1 + y)
+
+
+def _stretch(y: float, inclined: float, swelling: float) -> tuple[float, float, float]:
+    """Solve (y - inclined) x(y)^2 = swelling for the squared stretch 1 + y of a bulged film, x = 1 - (1 + y)^-2.
+
+    Returns y, x and dx/dy.
+    """
+    if y <= inclined:
+        y = inclined + math.cbrt(swelling)
+    while True:
+        u = 1 / (1 + y)
+        x = 1 - u * u
+        xy = 2 * u * u * u
+        correction = (swelling - (y - inclined) * x * x) / (x * (x + 2 * (y - inclined) * xy))
+        y += correction
+        y = max(y, inclined)
+        if -1e-9 < correction < 1e-9:
+            return y, x, xy
