@@ -26,6 +26,7 @@ class StageSection(Section):
     inverted: bool = False
     minimum_mm: float
     maximum_mm: float
+    start_mm: float | None = None
     reference_on_start: bool = False
     reply_timeout_ms: Annotated[float, Field(ge=20, le=5000)] = 400.0
 

@@ -73,8 +73,8 @@ class Instruments:
 class Reporter:
     """Carries steps, events and predictions to store and observers. A failing observer is dropped, loudly."""
 
-    def __init__(self, store: Store | None, observers: Iterable[Observer]) -> None:
-        self._store = store
+    def __init__(self, observers: Iterable[Observer] = ()) -> None:
+        self.store: Store | None = None
         self._observers = list(observers)
         self._step = ""
         self._frames = 0
@@ -107,14 +107,14 @@ class Reporter:
     def event(self, kind: str, text: str) -> None:
         """A line for the log."""
         event = Event(self.sample, kind, text)
-        if self._store is not None:
-            self._store.event(event)
+        if self.store is not None:
+            self.store.event(event)
         self.notify("event", event)
 
     def prediction(self, prediction: Any, text: str) -> None:
         """A live prediction, and its form in the recording."""
-        if self._store is not None:
-            self._store.prediction(self.sample, text)
+        if self.store is not None:
+            self.store.prediction(self.sample, text)
         self.notify("prediction", prediction)
 
     def notify(self, what: str, subject: Any) -> None:
@@ -127,8 +127,8 @@ class Reporter:
                 self.event("warning", f"observer {type(observer).__name__} failed and was dropped: {error!r}")
 
     def _tell(self, event: StepEvent) -> None:
-        if self._store is not None:
-            self._store.step(event)
+        if self.store is not None:
+            self.store.step(event)
         self.notify("step", event)
 
 

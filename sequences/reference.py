@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 from sequences.errors import StepFailed
 from sequences.frame import Frame
 from sequences.step import Apparatus, Motion, Step, Steps, stopping_on_failure
 
-PARK_SPEED = 1e-3
+PARK_SPEED = 500e-6
 LONGEST_SECONDS = 120.0
 
 
-def reference(apparatus: Apparatus) -> list[Step]:
-    """Return the steps that reference the axis and park it at the highest allowed position."""
+def reference(apparatus: Apparatus, start: float | None = None) -> list[Step]:
+    """Return the steps that reference the axis and park it at ``start`` (m), or at the highest allowed position."""
 
     def seek(frame: Frame) -> Steps:
         with stopping_on_failure(apparatus.stage):
@@ -28,8 +26,8 @@ def reference(apparatus: Apparatus) -> list[Step]:
         return frame
 
     def park(frame: Frame) -> Steps:
-        target = apparatus.stage.travel[1]
-        motion = Motion(apparatus, target, PARK_SPEED, look_ahead=math.inf)
+        target = apparatus.stage.travel[1] if start is None else start
+        motion = Motion(apparatus, target, PARK_SPEED)
         deadline = frame.stop + round(LONGEST_SECONDS * frame.rate)
         try:
             while not motion.arrived(frame):
@@ -42,4 +40,4 @@ def reference(apparatus: Apparatus) -> list[Step]:
             apparatus.stage.stop()
         return frame
 
-    return [Step("reference", "the switch is found", seek), Step("park", "at the top of the travel", park)]
+    return [Step("reference", "the switch is found", seek), Step("park", "at the starting height", park)]

@@ -1,0 +1,272 @@
+"""One run from scene and bench to the closed recording. Every way out leads through the safe state."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from drivers.errors import DeviceError
+from rig.bench import Bench
+from rig.check import check
+from rig.commanded import CommandedPump, CommandedStage
+from rig.errors import Refused, RigError
+from rig.instruments import Opened, open_instruments
+from rig.interlocks import Interlocks, Limits
+from rig.loop import Instruments, Loop, Reporter
+from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
+from rig.protocols import build_steps
+from rig.recorder import Recorder
+from rig.safe_state import make_safe, release
+from rig.scene import Scene
+from sequences.errors import StepFailed
+from sequences.reference import reference
+from sequences.step import Apparatus, Step, play
+
+if TYPE_CHECKING:
+    from drivers.emulated.faults import Faults
+
+_REPORTED = (DeviceError, RigError, StepFailed)
+_LIBRARIES = ("membrane-adhesion-rig", "numpy", "h5py", "pipython", "pyserial", "nidaqmx", "grpcio")
+
+
+@dataclass
+class Request:
+    """What to run.
+
+    Attributes
+    ----------
+    scene_text, bench_text
+        The files as they were read; they are kept in the recording.
+    seed, speed, wire, faults
+        For the emulated bench only: ``speed`` in times real time, ``None`` as fast as possible; ``wire`` false puts
+        the instruments straight on the plant.
+    """
+
+    scene: Scene
+    scene_text: str
+    bench: Bench
+    bench_text: str
+    out: Path
+    seed: int = 0
+    speed: float | None = None
+    wire: bool = True
+    faults: Faults | None = None
+    observers: Iterable[Observer] = ()
+    controls: Controls = field(default_factory=Controls)
+    repeat: int = 1
+    repeats: int = 1
+
+
+def run_scene(request: Request) -> Ending:
+    """Run one scene and record it.
+
+    Raises
+    ------
+    RigError, DeviceError
+        Before the recording has begun; nothing has moved but, where the bench allows it, the reference move.
+        Afterwards every failure is in the returned ending and in the recording.
+    """
+    check(request.scene, request.bench)
+    opened = open_instruments(request)
+    try:
+        with _signals(request.controls, opened):
+            _make_ready(request, opened)
+            return _recorded(request, opened)
+    finally:
+        failures = make_safe(opened.stage, opened.pump, opened.daq)
+        failures += release(opened.stage, opened.pump, opened.daq)
+        opened.shut_down()
+        for failure in failures:
+            print(f"rig: {failure}. Remedy: switch the device off by hand.", file=sys.stderr)
+
+
+def _recorded(request: Request, opened: Opened) -> Ending:
+    reporter = Reporter(observers := list(request.observers) + opened.observers)
+    stage = CommandedStage(opened.stage, lambda text: reporter.event("command", text))
+    pump = None if opened.pump is None else CommandedPump(opened.pump, lambda text: reporter.event("command", text))
+    apparatus = Apparatus(stage, pump, reporter, request.bench.limits.look_ahead_um * 1e-6)
+    steps = build_steps(request.scene, apparatus)
+    info = _info(request, opened, steps)
+    recorder = Recorder(request.out, info, opened.daq.channels, _metadata(request))
+    reporter.store = recorder
+    ending = Ending("failed before the first frame", 1, 0)
+    loop = _loop(request, opened, Instruments(stage, pump, opened.daq, opened.clock), reporter, recorder)
+    try:
+        reporter.notify("started", info)
+        ending = _play(loop, steps, reporter)
+    finally:
+        failures = make_safe(stage, pump, opened.daq)
+        ending = _finish(recorder, reporter, ending, failures, loop.samples)
+    for observer in observers:
+        observer.finished(ending)
+    return ending
+
+
+def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
+    try:
+        loop.run(play(steps, reporter))
+    except _REPORTED as error:
+        kind = "interlock" if loop.interlock_latency is not None else "fault"
+        where = "" if f"step {reporter.step}" in str(error) else f" (in step {reporter.step})"
+        reporter.event(kind, f"{error}{where}")
+        if loop.interlock_latency is not None:
+            reporter.event("note", f"stop sent {loop.interlock_latency * 1e3:.2f} ms after the frame was read")
+        return Ending(f"{error}{where}", int(getattr(error, "exit_code", 1)), loop.samples)
+    return Ending("done", 0, loop.samples)
+
+
+def _finish(recorder: Recorder, reporter: Reporter, ending: Ending, failures: list[str], samples: int) -> Ending:
+    """Close the recording whatever has happened; a disk that is full must not hide how the run ended."""
+    reason = "; ".join([ending.reason, *failures])
+    ending = Ending(reason, ending.exit_code if ending.exit_code or not failures else 1, samples)
+    try:
+        for failure in failures:
+            reporter.event("fault", failure)
+        reporter.event("end", ending.reason)
+        recorder.end(ending)
+        recorder.close()
+    except (RigError, OSError, RuntimeError) as error:
+        return Ending(f"{ending.reason}; {error}", ending.exit_code or 2, samples)
+    return ending
+
+
+def _loop(
+    request: Request, opened: Opened, instruments: Instruments, reporter: Reporter, recorder: Recorder | None
+) -> Loop:
+    bench = request.bench
+    travel = opened.stage.travel if recorder is not None else (-float("inf"), float("inf"))
+    interlocks = Interlocks(
+        Limits(
+            compression=bench.limits.compression_N,
+            tension=bench.limits.tension_N,
+            travel=travel,
+            pressure=None
+            if opened.pump is None
+            else (bench.limits.pressure_low_kPa * 1e3, bench.limits.pressure_high_kPa * 1e3),
+            lag=bench.limits.lag_s,
+        )
+    )
+    frame_samples = max(1, round(bench.daq.frame_ms * 1e-3 * opened.daq.rate))
+    return Loop(
+        instruments,
+        opened.converter,
+        interlocks,
+        recorder,
+        reporter,
+        request.controls,
+        frame_samples=frame_samples,
+    )
+
+
+def _make_ready(request: Request, opened: Opened) -> None:
+    """Reference the stage if the bench allows it, or refuse; switch the servo on."""
+    if not opened.stage.referenced:
+        if not request.bench.stage.reference_on_start:
+            raise Refused(
+                "the stage is not referenced. Remedy: take specimen and gripper out of its path and run `rig reference`"
+            )
+        reference_stage(request, opened)
+    opened.stage.servo(True)
+
+
+def reference_stage(request: Request, opened: Opened) -> None:
+    """Run the reference sequence under the force interlock, without a recording."""
+    reporter = Reporter(opened.observers)
+    apparatus = Apparatus(opened.stage, None, reporter, request.bench.limits.look_ahead_um * 1e-6)
+    instruments = Instruments(opened.stage, None, opened.daq, opened.clock)
+    start = request.bench.stage.start_mm
+    steps = reference(apparatus, None if start is None else start * 1e-3)
+    try:
+        _loop(request, opened, instruments, reporter, None).run(play(steps, reporter))
+    finally:
+        opened.daq.stop()
+
+
+def _info(request: Request, opened: Opened, steps: list[Step]) -> RunInfo:
+    bench, (low, high) = request.bench, opened.stage.travel
+    limits = {
+        "compression_N": bench.limits.compression_N,
+        "tension_N": bench.limits.tension_N,
+        "travel_low_m": low,
+        "travel_high_m": high,
+        "force_capacity_N": bench.force.capacity_N,
+    }
+    if opened.pump is not None and bench.pump is not None:
+        slowest, fastest = opened.pump.rate_limits
+        limits |= {
+            "pressure_low_Pa": bench.limits.pressure_low_kPa * 1e3,
+            "pressure_high_Pa": bench.limits.pressure_high_kPa * 1e3,
+            "pump_slowest_m3_s": slowest,
+            "pump_fastest_m3_s": fastest,
+            "syringe_m3": bench.pump.syringe_volume_ml * 1e-6,
+        }
+    return RunInfo(
+        title=request.scene.title,
+        protocol=request.scene.protocol.name,
+        recording=str(request.out),
+        pid=os.getpid(),
+        rate=opened.daq.rate,
+        frame_samples=max(1, round(bench.daq.frame_ms * 1e-3 * opened.daq.rate)),
+        uses_pressure=opened.pump is not None,
+        plan=tuple(StepPlan(step.name, step.condition) for step in steps),
+        limits=limits,
+        scene=request.scene.model_dump(),
+        identities=opened.identities(),
+        virtual=opened.virtual,
+        repeat=request.repeat,
+        repeats=request.repeats,
+    )
+
+
+def _metadata(request: Request) -> dict[str, str]:
+    import psutil
+
+    return {
+        "scene": request.scene_text,
+        "bench": request.bench_text,
+        "seed": str(request.seed),
+        "versions": json.dumps(
+            {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}, sort_keys=True
+        ),
+        "process_started": repr(psutil.Process().create_time()),
+    }
+
+
+@contextmanager
+def _signals(controls: Controls, opened: Opened) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the run in good order; a second one sends the emergency stop at once.
+
+    Signals never raise here: the loop leaves through the safe state, undisturbed.
+    """
+    controls.connect(opened.stage.emergency_stop)
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    count = 0
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        nonlocal count
+        count += 1
+        if count == 1:
+            controls.stop()
+        else:
+            controls.emergency_stop()
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    before: dict[signal.Signals, Any] = {number: signal.signal(number, on_signal) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
