@@ -1,0 +1,209 @@
+"""The membrane-adhesion model of both papers: a truncated cone between rim and contact edge.
+
+``cone`` is EML 2020 Eqs. 1-14, ``cone-2017`` the same without the energy stored in the contact (PNAS 2017 SI, S3-S12).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from model.cone_branch import Branch, Point, largest_slope
+from model.cone_error import of_features
+from model.cone_path import Path, strongest_pull, trace, zero_of_force
+from model.cone_terms import Cone, Driven, Gas, Isothermal, Vented
+from model.parameters import GasAnchor, Parameters
+from model.prediction import Array, Jump, Outcome, Prediction
+from model.start import check, start_position, start_radius
+
+NODES = 64
+"""Radii at which the branch is scanned for folds; the features themselves are solved to machine precision."""
+
+
+class Scales(NamedTuple):
+    """What the dimensionless quantities are multiplied with, SI."""
+
+    length: float
+    force: float
+    pressure: float
+
+    @property
+    def energy(self) -> float:
+        """J."""
+        return self.force * self.length
+
+
+def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int = 200, nodes: int = NODES) -> Prediction:
+    """Predict one pull-off test with the cone model.
+
+    Parameters
+    ----------
+    parameters
+        The scene, SI units.
+    contact_stretch
+        Whether the stretch of the membrane in contact stores energy (EML's W_2) or not (PNAS 2017).
+    points
+        Number of points of the profile; the features do not depend on it.
+    nodes
+        Radii of the scan that brackets folds, peaks and crossings.
+
+    Raises
+    ------
+    InvalidParameter
+        A parameter lies outside its physical range.
+    NotConverged
+        The equilibrium could not be solved.
+    """
+    begin = time.perf_counter()
+    check(parameters)
+    cone, scales = nondimensional(parameters, contact_stretch)
+    name = "cone" if contact_stretch else "cone-2017"
+    assumptions = {
+        "shape": "truncated cone",
+        "gas anchor": str(parameters.gas.anchor),
+        "contact stretch": "uniform (EML Eq. 5)" if contact_stretch and cone.sphere is not None else "none",
+    }
+
+    def without_features(outcome: Outcome) -> Prediction:
+        return Prediction(
+            name, outcome, assumptions, evaluations=cone.evaluations, runtime_s=time.perf_counter() - begin
+        )
+
+    edge = cone.edge(cone.start_radius)
+    height = cone.start_position + edge.drop
+    if isinstance(cone.gas, Isothermal) and cone.gas.anchor + cone.gas.offset + start_growth(cone) <= 0:
+        return without_features(Outcome.CHAMBER_CLOSED)
+    if cone.adhesion == 0 and cone.sphere is None and not cone.state(edge, 0.0).pressure > 0:
+        suction = cone.state(edge, 0.0).pressure < 0
+        return without_features(Outcome.NO_EQUILIBRIUM if suction else Outcome.NO_ADHESION)
+    branch = Branch(cone, nodes)
+    path = trace(branch, height / edge.gap if edge.gap > 0 else -edge.slope)
+    zero = zero_of_force(branch, path)
+    if zero is None:
+        return without_features(Outcome.NO_ADHESION)
+    peak = strongest_pull(branch, path)
+    profile = sample(branch, path, (zero, peak), points)
+    detachment = path.detachment
+    length, force = scales.length, scales.force
+    return Prediction(
+        name,
+        Outcome.PULL_OFF,
+        assumptions,
+        pull_off_force=-peak.force * force,
+        pull_off_distance=(detachment.position - zero.position) * length,
+        retraction_at_pull_off=(peak.position - zero.position) * length,
+        zero_force_position=zero.position * length,
+        onset_position=path.onset.position * length,
+        detachment_position=detachment.position * length,
+        detachment_radius=detachment.radius * length,
+        position=profile.position * length,
+        retraction=(profile.position - zero.position) * length,
+        force=profile.force * force,
+        pressure=profile.pressure * scales.pressure,
+        contact_radius=profile.radius * length,
+        stable=np.ones(len(profile.radius), dtype=bool),
+        jumps=tuple(_jumps(path, scales)),
+        numerical_error={
+            name: error * (force if name == "pull_off_force" else length)
+            for name, error in of_features(branch, zero, peak, detachment).items()
+        },
+        runtime_s=time.perf_counter() - begin,
+        evaluations=cone.evaluations,
+    )
+
+
+def nondimensional(parameters: Parameters, contact_stretch: bool) -> tuple[Cone, Scales]:
+    """Return the dimensionless scene and its scales."""
+    substrate, gripper, membrane = parameters.substrate, parameters.gripper, parameters.membrane
+    length = gripper.radius
+    stiffness = membrane.youngs_modulus * membrane.thickness  # N/m
+    scales = Scales(length, math.pi * stiffness * length / 6, stiffness / (2 * length))
+    cone = Cone(
+        adhesion=12 * membrane.work_of_adhesion / stiffness,
+        sphere=None if substrate.shape == "flat" else substrate.radius / length,
+        start_radius=start_radius(substrate, gripper) / length,
+        start_position=start_position(substrate, gripper) / length,
+        gas=Vented(0.0),
+        contact_stretch=contact_stretch,
+    )
+    cone.gas = _gas(parameters, scales, cone)
+    return cone, scales
+
+
+def _gas(parameters: Parameters, scales: Scales, cone: Cone) -> Gas:
+    gas = parameters.gas
+    initial, atmosphere = gas.initial_pressure / scales.pressure, gas.atmospheric_pressure / scales.pressure
+    if gas.anchor is GasAnchor.VENTED:
+        return Vented(initial)
+    if gas.anchor is GasAnchor.MEASURED:
+        assert gas.measured is not None
+        position, pressure = (np.asarray(values, dtype=float) for values in gas.measured)
+        return Driven(position / scales.length, pressure / scales.pressure)
+    chamber = parameters.gripper.chamber_volume / (math.pi * scales.length**3 / 3)
+    if gas.anchor is GasAnchor.START:
+        growth = start_growth(cone)
+        return Isothermal(initial, atmosphere, chamber + growth, -growth)
+    return Isothermal(initial, atmosphere, chamber)
+
+
+def start_growth(cone: Cone) -> float:
+    """Return V(z_0, r_i) - V_0, regular also where the contact reaches the rim."""
+    edge, radius = cone.edge(cone.start_radius), cone.start_radius
+    return float((cone.start_position + edge.drop) * (1 + radius + radius**2) - edge.cap)
+
+
+class Profile(NamedTuple):
+    """Arrays along the path, dimensionless."""
+
+    radius: Array
+    position: Array
+    force: Array
+    pressure: Array
+
+
+def sample(branch: Branch, path: Path, marks: tuple[Point, ...], points: int) -> Profile:
+    """Return the path at about evenly spread points, the marked ones among them."""
+    cone = branch.cone
+    pinned, stretches = path.pinned, path.stretches
+    whole = path.detachment.position - pinned.first.position
+    share = (pinned.last.position - pinned.first.position) / whole if whole > 0 else 0.0
+    held = max(2, round((points - len(marks)) * min(share, 0.5)))
+    free = max(points - len(marks) - held, 2 * len(stretches))
+    t = np.linspace(pinned.first.t, pinned.last.t, held + 1)[:-1]
+    edge = cone.edge(np.full(held, cone.start_radius))
+    held_state = cone.state(edge, t)
+    held_position = cone.position(edge, t)
+    radius = np.concatenate(
+        [
+            np.linspace(stretch.first.radius, stretch.last.radius, max(2, free // len(stretches)))
+            for stretch in stretches
+        ]
+    )
+    start = np.interp(radius, branch.radius[::-1], branch.t[::-1])
+    inner = radius > 0
+    free_edge = cone.edge(np.where(inner, radius, branch.radius[-2]))
+    free_t = np.where(inner, largest_slope(cone, free_edge, start), branch.t[-1])
+    free_edge = cone.edge(radius)
+    state = cone.state(free_edge, free_t)
+    return Profile(
+        np.concatenate((edge.radius, radius)),
+        np.concatenate((held_position, cone.position(free_edge, free_t))),
+        np.concatenate((held_state.force, state.force)),
+        np.concatenate((held_state.pressure + np.zeros(held), state.pressure + np.zeros(radius.size))),
+    )
+
+
+def _jumps(path: Path, scales: Scales) -> list[Jump]:
+    return [
+        Jump(
+            before.last.position * scales.length,
+            before.last.radius * scales.length,
+            after.first.radius * scales.length,
+            before.last.force * scales.force,
+            after.first.force * scales.force,
+        )
+        for before, after in zip(path.stretches, path.stretches[1:], strict=False)
+    ]

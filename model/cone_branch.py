@@ -1,0 +1,246 @@
+"""The equilibrium branch of the cone model: for every contact radius the largest root in z of dPi/dr = 0.
+
+Parametrised by the contact radius the branch is single valued, so the folds in z (where the contact jumps or
+detaches) are ordinary maxima. The root exists for every radius: where the cone leaves the sphere along its tangent
+the pressure has no lever and dPi/dr is negative, and it is positive above a bound given in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.cone_terms import Cone, Driven, Edge, Isothermal, Number, Vented
+from model.errors import NotConverged
+from model.prediction import Array
+from model.roots import EPSILON, bracketed
+
+ITERATIONS = 200
+NOISE = 1e-9
+"""Steps below this that no longer shrink are rounding noise; the error estimate says how much of it there is."""
+
+
+def bounds(cone: Cone, edge: Edge) -> tuple[Array, Array]:
+    """Return slopes t below and above the largest root, for an array of contact radii.
+
+    dPi/drho >= 2 g(t) + load - b (t + slope) for t >= 0, where g is the stretch energy and b bounds the pressure's
+    lever; and the pressure helps no more once it is negative.
+    """
+    lever = (1 + 2 * edge.radius) * edge.gap
+    tangent = np.zeros_like(edge.radius) - edge.slope
+    gas = cone.gas
+    if isinstance(gas, Isothermal):
+        widening = edge.gap * (1 + edge.radius + edge.radius**2)
+        level = gas.anchor + gas.offset - edge.cap  # the volume at t = 0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            empty = -level / widening
+            neutral = np.maximum((gas.neutral_growth + edge.cap) / widening, 0.0)
+            highest = np.where(level > 0, gas.at(-edge.cap)[0], np.inf)
+            first = _balance(edge, np.maximum(highest, 0.0) * lever)
+        second = np.maximum(neutral, _balance(edge, 0.0))
+        return np.maximum(tangent, empty), np.where(np.isfinite(first), np.minimum(first, second), second)
+    highest = gas.initial if isinstance(gas, Vented) else gas.pressure.max()
+    return tangent, _balance(edge, np.maximum(highest, 0.0) * lever)
+
+
+def _balance(edge: Edge, lever: Number) -> Array:
+    """Return t with 2 g(t) >= a + b t: the larger of the solutions of g = a and of g / t >= b."""
+    a = np.maximum(lever * edge.slope - edge.load, 0.0)
+    from_adhesion = np.sqrt((a + np.sqrt(a * (a + 4))) / 2)
+    result: Array = np.maximum(from_adhesion, lever + np.cbrt(lever))
+    return result
+
+
+def largest_slope(cone: Cone, edge: Edge, start: Array | None = None) -> Array:
+    """Return the largest root t of dPi/drho = 0 for an array of contact radii (Newton, kept inside its bracket)."""
+    low, high = bounds(cone, edge)
+    if start is None:
+        start, low, high = _cold_start(cone, edge, low, high)
+    t = np.clip(start, low, high)
+    previous = np.full_like(t, np.inf)
+    for _ in range(ITERATIONS):
+        with np.errstate(all="ignore"):
+            value, slope = cone.residual(edge, t)
+            proposal = t - value / slope
+        low = np.where(value < 0, t, low)
+        high = np.where(value > 0, t, high)
+        outside = ~((proposal >= low) & (proposal <= high))
+        if outside.any():
+            proposal = np.where(outside, (low + high) / 2, proposal)
+        proposal = np.where(value == 0, t, proposal)
+        step = np.abs(proposal - t)
+        t = proposal
+        scale = np.abs(t) + edge.slope
+        if ((step <= 8 * EPSILON * scale) | ((step <= NOISE * scale) & (step >= previous / 2))).all():
+            return t
+        previous = step
+    raise NotConverged(f"the equilibrium branch did not settle: largest last step {step.max():.3g} in the cone's slope")
+
+
+def _cold_start(cone: Cone, edge: Edge, low: Array, high: Array) -> tuple[Array, Array, Array]:
+    """Start at the upper bound, from where Newton's steps fall monotonically; below t = 0 from the cubic term."""
+    if isinstance(cone.gas, Driven):
+        low, high = _last_crossing(cone, edge, cone.gas, low, high)
+        return high, low, high
+    if cone.sphere is None:
+        return high, low, high
+    reaches = low < 0
+    with np.errstate(all="ignore"):
+        value, _ = cone.residual(edge, np.where(reaches, 0.0, high))
+        cubic = -np.cbrt(value / (4 * (1 + edge.radius) * edge.slope))
+    below = reaches & (value > 0)
+    start = np.where(below, np.maximum(cubic, low / 2), high)
+    return start, np.where(reaches & ~below, 0.0, low), np.where(below, 0.0, high)
+
+
+def _last_crossing(cone: Cone, edge: Edge, gas: Driven, low: Array, high: Array) -> tuple[Array, Array]:
+    """Narrow the bracket to the last knot of a measured pressure at which the contact is still held."""
+    position = np.unique(np.concatenate((gas.position, np.linspace(gas.position[0], gas.position[-1], 65))))
+    column = Edge(*(np.reshape(part, (-1, 1)) if isinstance(part, np.ndarray) else part for part in edge))
+    with np.errstate(all="ignore"):
+        t = (position + column.drop) / column.gap
+    t = np.clip(np.where(np.isfinite(t), t, high[:, None]), low[:, None], high[:, None])
+    t = np.concatenate((low[:, None], t, high[:, None]), axis=1)
+    held = cone.residual(column, t)[0] < 0
+    last = t.shape[1] - 2 - np.argmax(held[:, -2::-1], axis=1)
+    rows = np.arange(t.shape[0])
+    return t[rows, last], t[rows, last + 1]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One equilibrium of the branch."""
+
+    radius: float
+    t: float
+    position: float
+    force: float
+
+
+class Branch:
+    """The branch of one scene (floats): scanned once, then evaluated exactly where it matters."""
+
+    def __init__(self, cone: Cone, nodes: int) -> None:
+        self.cone = cone
+        half = np.sin(np.linspace(np.pi / 2, 0.0, nodes + 1)[:-1]) ** 2
+        self.radius = cone.start_radius * half
+        self.edge = cone.edge(self.radius)
+        self.t = largest_slope(cone, self.edge)
+        state = cone.state(self.edge, self.t)
+        self.force = state.force
+        tilt = state.residual_radius / state.residual_t
+        self.position = cone.position(self.edge, self.t)
+        self.climb = -(self.t + self.edge.slope) - self.edge.gap * tilt
+        self.force_climb = state.force_radius - state.force_t * tilt
+        self._append_centre()
+        self._last = (self.radius[0], self.t[0], -tilt[0])
+
+    def _append_centre(self) -> None:
+        """Add the limit r -> 0: the cone of an inflated membrane touching the apex, or no contact at z = 0."""
+        t = self._centre()
+        edge = self.cone.edge(0.0)
+        climb, force_climb = (1.0 if self.cone.adhesion > 0 else -1.0), 0.0
+        if t > 0:
+            state = self.cone.state(edge, t)
+            tilt = state.residual_radius / state.residual_t
+            climb, force_climb = -t - tilt, state.force_radius - state.force_t * tilt
+        self.radius = np.append(self.radius, 0.0)
+        self.t = np.append(self.t, t)
+        self.position = np.append(self.position, t)
+        self.force = np.append(self.force, 0.0 if t > 0 else self.cone.state(edge, 0.0).force)
+        self.climb = np.append(self.climb, climb)
+        self.force_climb = np.append(self.force_climb, force_climb)
+
+    def _centre(self) -> float:
+        edge = self.cone.edge(0.0)
+        start = self.cone.state(edge, 0.0)
+        if not start.pressure > 0:
+            return 0.0
+        high = float(bounds(self.cone, Edge(*(np.array([part]) for part in edge)))[1][0])
+        while (end := self.cone.state(edge, high).force) > 0:
+            high *= 2
+        return bracketed(lambda t: self.cone.state(edge, t).force, 0.0, high, start.force, end)
+
+    def at(self, radius: float) -> tuple[Edge, float]:
+        """Return the equilibrium at one radius: Newton from the tangent at the last one, else from scratch."""
+        edge = self.cone.edge(radius)
+        last_radius, last_t, last_slope = self._last
+        t = last_t + last_slope * (radius - last_radius)
+        for _ in range(12):
+            value, slope = self.cone.residual(edge, t)
+            if not slope > 0:
+                break
+            step = value / slope
+            t -= step
+            if abs(step) <= 4 * EPSILON * (abs(t) + edge.slope):
+                if t + edge.slope < 0:
+                    break
+                self._last = (radius, t, last_slope)
+                return edge, t
+        t = float(largest_slope(self.cone, self.cone.edge(np.array([radius])))[0])
+        self._last = (radius, t, last_slope)
+        return edge, t
+
+    def climb_at(self, radius: float) -> float:
+        """Return dz/drho along the branch; negative where it is stable under displacement control."""
+        edge, t = self.at(radius)
+        state = self.cone.state(edge, t)
+        tilt = state.residual_radius / state.residual_t
+        self._last = (radius, t, -tilt)
+        return float(-(t + edge.slope) - edge.gap * tilt)
+
+    def force_climb_at(self, radius: float) -> float:
+        """Return dF/drho along the branch."""
+        edge, t = self.at(radius)
+        state = self.cone.state(edge, t)
+        tilt = state.residual_radius / state.residual_t
+        self._last = (radius, t, -tilt)
+        return float(state.force_radius - state.force_t * tilt)
+
+    def point(self, radius: float) -> Point:
+        """Return the equilibrium at one radius."""
+        if radius == 0.0:
+            return Point(0.0, float(self.t[-1]), float(self.position[-1]), float(self.force[-1]))
+        edge, t = self.at(radius)
+        return Point(radius, t, self.cone.position(edge, t), self.cone.state(edge, t).force)
+
+    def node(self, index: int) -> Point:
+        """Return a node of the scan."""
+        return Point(
+            float(self.radius[index]), float(self.t[index]), float(self.position[index]), float(self.force[index])
+        )
+
+    def turning(self, index: int) -> Point:
+        """Return the extremum of z between the nodes ``index`` and ``index + 1``."""
+        return self._refine(self.climb_at, self.climb, index)
+
+    def extremum_of_force(self, index: int) -> Point:
+        """Return the extremum of the force between the nodes ``index`` and ``index + 1``."""
+        return self._refine(self.force_climb_at, self.force_climb, index)
+
+    def where_force_vanishes(self, before: Point, after: Point) -> Point:
+        """Return the zero of the force between two points of one stretch of the branch."""
+        return self._solve(lambda radius: self.point(radius).force, before, after, before.force, after.force)
+
+    def where_position_is(self, position: float, before: Point, after: Point) -> Point:
+        """Return the point at a height between those of two points of one stretch of the branch."""
+        return self._solve(
+            lambda radius: self.point(radius).position - position,
+            before,
+            after,
+            before.position - position,
+            after.position - position,
+        )
+
+    def _refine(self, function, values: Array, index: int) -> Point:  # type: ignore[no-untyped-def]
+        before, after = self.node(index), self.node(index + 1)
+        return self._solve(function, before, after, float(values[index]), float(values[index + 1]))
+
+    def _solve(self, function, before: Point, after: Point, value_before: float, value_after: float) -> Point:  # type: ignore[no-untyped-def]
+        self._last = (
+            before.radius,
+            before.t,
+            0.0 if before.radius == after.radius else (before.t - after.t) / (before.radius - after.radius),
+        )
+        return self.point(bracketed(function, before.radius, after.radius, value_before, value_after))

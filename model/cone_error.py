@@ -1,0 +1,98 @@
+"""Rounding error of the cone model's features, propagated from the terms of the equations to first order.
+
+The features are roots and extrema of closed-form functions solved until the steps no longer shrink, so what remains
+is rounding: each term contributes its magnitude times the machine epsilon, divided by the slope of what was solved.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from model.cone_branch import Branch, Point
+from model.cone_terms import Cone, Driven, Edge, Isothermal, stretch_energy
+from model.roots import EPSILON
+
+SAFETY = 8.0
+"""Rounding errors per term allowed for."""
+
+
+class Uncertainty(NamedTuple):
+    """Absolute errors at one equilibrium, dimensionless."""
+
+    position: float
+    force: float
+
+
+def rounding(cone: Cone, edge: Edge, t: float) -> tuple[float, float, float]:
+    """Return the summed magnitudes of the terms of residual, force and position."""
+    energy, energy_t, _ = stretch_energy(t)
+    tau = abs(t) + edge.slope
+    pressure = pressure_terms(cone, edge, t)
+    radius = edge.radius
+    load = cone.adhesion * radius + abs(edge.load + cone.adhesion * radius)
+    residual = (1 + radius) * tau * abs(energy_t) + 2 * radius * energy + load
+    residual += pressure * (1 + 2 * radius) * edge.gap * tau
+    force = (1 + radius) * abs(energy_t) + pressure * (1 + radius + radius**2)
+    return residual, force, edge.gap * abs(t) + edge.drop
+
+
+def pressure_terms(cone: Cone, edge: Edge, t: float) -> float:
+    """Return the summed magnitudes of the terms of the gauge pressure."""
+    gas = cone.gas
+    if not isinstance(gas, Isothermal):
+        return abs(gas.at(cone.position(edge, t))[0]) if isinstance(gas, Driven) else abs(gas.initial)
+    change = cone.growth(edge, t) + gas.offset
+    terms = edge.gap * abs(t) * (1 + edge.radius + edge.radius**2) + edge.cap + abs(gas.offset)
+    return float((abs(gas.initial) * gas.anchor + gas.atmosphere * terms) / (gas.anchor + change))
+
+
+def on_branch(branch: Branch, point: Point) -> Uncertainty:
+    """Return the errors of z and F_r at one contact radius."""
+    cone = branch.cone
+    edge = cone.edge(point.radius)
+    residual, force, position = rounding(cone, edge, point.t)
+    state = cone.state(edge, point.t)
+    slope = residual / state.residual_t if state.residual_t > 0 else abs(point.t)
+    unit = SAFETY * EPSILON
+    return Uncertainty(unit * (position + edge.gap * slope), unit * (force + abs(state.force_t) * slope))
+
+
+def when_pinned(branch: Branch, point: Point) -> Uncertainty:
+    """Return the errors of z and F_r at one slope of the cone, the contact held at r_i."""
+    cone = branch.cone
+    _, force, position = rounding(cone, cone.edge(point.radius), point.t)
+    return Uncertainty(SAFETY * EPSILON * position, SAFETY * EPSILON * force)
+
+
+def of_features(branch: Branch, zero: Point, peak: Point, detachment: Point) -> dict[str, float]:
+    """Return the absolute error of each feature, dimensionless."""
+    at_zero, at_peak, at_end = (_anywhere(branch, point) for point in (zero, peak, detachment))
+    zero_position = at_zero.position + at_zero.force * _yield(branch, zero)
+    return {
+        "pull_off_force": at_peak.force,
+        "pull_off_distance": at_end.position + zero_position,
+        "zero_force_position": zero_position,
+        "onset_position": on_branch(branch, branch.node(0)).position,
+        "detachment_position": at_end.position,
+    }
+
+
+def _anywhere(branch: Branch, point: Point) -> Uncertainty:
+    return (when_pinned if _is_pinned(branch, point) else on_branch)(branch, point)
+
+
+def _is_pinned(branch: Branch, point: Point) -> bool:
+    return point.radius == branch.cone.start_radius and point.t < branch.t[0]
+
+
+def _yield(branch: Branch, point: Point) -> float:
+    """Return |dz/dF| along the path, by which an error of the force shifts a zero of the force."""
+    cone = branch.cone
+    edge = cone.edge(point.radius)
+    state = cone.state(edge, point.t)
+    if _is_pinned(branch, point):
+        return abs(edge.gap / state.force_t) if state.force_t else 0.0
+    tilt = state.residual_radius / state.residual_t if state.residual_t else 0.0
+    climb = point.t + edge.slope + edge.gap * tilt
+    force_climb = state.force_radius - state.force_t * tilt
+    return abs(climb / force_climb) if force_climb else 0.0

@@ -1,0 +1,50 @@
+"""Bracketed root finding to machine precision, for floats and for many brackets at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+EPSILON = 2.220446049250313e-16
+
+
+def bracketed(
+    function: Callable[[float], float], a: float, b: float, fa: float, fb: float, guess: float | None = None
+) -> float:
+    """Return the root between ``a`` and ``b``, where the function takes the values ``fa`` and ``fb`` of opposite sign.
+
+    Chandrupatla's method (Advances in Engineering Software 28, 1997): inverse quadratic steps where they are safe,
+    bisection otherwise. ``guess`` is tried first.
+    """
+    if fa == 0.0:
+        return a
+    if fb == 0.0:
+        return b
+    fraction = 0.5 if guess is None else min(max((guess - a) / (b - a), 1e-6), 1 - 1e-6)
+    for _ in range(200):
+        x = a + fraction * (b - a)
+        fx = function(x)
+        if (fx > 0) == (fa > 0):
+            c, fc = a, fa
+        else:
+            c, fc = b, fb
+            b, fb = a, fa
+        a, fa = x, fx
+        best = a if abs(fa) < abs(fb) else b
+        tolerance = 2 * EPSILON * abs(best) + 5e-324
+        limit = tolerance / abs(b - a) if b != a else 1.0
+        if limit > 0.5 or fa == 0.0 or fb == 0.0:
+            return best
+        fraction = _fraction(a, b, c, fa, fb, fc)
+        fraction = min(max(fraction, limit), 1 - limit)
+    return best
+
+
+def _fraction(a: float, b: float, c: float, fa: float, fb: float, fc: float) -> float:
+    if c == b or fc == fb or fb == fa:
+        return fa / (fa - fb) if fa != fb else 0.5
+    xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+    if phi**2 < xi and (1 - phi) ** 2 < 1 - xi:
+        step = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+        return step if math.isfinite(step) else 0.5
+    return 0.5

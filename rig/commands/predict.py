@@ -1,0 +1,185 @@
+"""``rig predict``: one pull-off test, as words, JSON or a picture."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from model.prediction import Prediction
+    from rig.scene import Scene
+
+FEATURES = {
+    "pull_off_force": "N",
+    "pull_off_distance": "m",
+    "retraction_at_pull_off": "m",
+    "zero_force_position": "m",
+    "detachment_position": "m",
+    "detachment_radius": "m",
+}
+"""Features of a prediction and their units, as they are named in JSON."""
+
+PROFILE = {"retraction": "m", "force": "N", "pressure": "Pa", "contact_radius": "m"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    from model import MODELS
+
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("--model", choices=MODELS, default="cone", help="adhesion model (default: cone)")
+    parser.add_argument("--pressure-kpa", type=float, metavar="X", help="initial pressure P_0 instead of the scene's")
+    parser.add_argument("--points", type=int, default=200, metavar="N", help="points of the profile (default: 200)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--profile", action="store_true", help="add the profile to the JSON, or print it as a table")
+    parser.add_argument("--plot", type=Path, metavar="PNG", help="draw F_r and P_a against retraction")
+    parser.add_argument(
+        "--rigid-bound",
+        action="store_true",
+        help="soft gripper: predict the rigid one instead, as a labelled bound",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Predict and print. A physical outcome other than pull-off is an answer; an impossible scene is an error."""
+    from rig.scene import load_scene
+
+    scene = load_scene(arguments.scene)
+    prediction = predict_scene(
+        scene,
+        str(arguments.scene),
+        model=arguments.model,
+        pressure_kPa=arguments.pressure_kpa,
+        points=arguments.points,
+        rigid_bound=arguments.rigid_bound,
+    )
+    if arguments.plot is not None:
+        from analysis.prediction_plot import draw_prediction
+
+        draw_prediction(prediction, scene.title, arguments.plot)
+    if arguments.json:
+        print(json.dumps(as_json(prediction, profile=arguments.profile), allow_nan=False))
+    else:
+        print(as_text(prediction, scene.title, profile=arguments.profile))
+    return 0
+
+
+def predict_scene(
+    scene: Scene,
+    source: str,
+    *,
+    model: str = "cone",
+    pressure_kPa: float | None = None,
+    points: int = 200,
+    rigid_bound: bool = False,
+) -> Prediction:
+    """Predict a scene of a file; errors name the file.
+
+    Raises
+    ------
+    FileError
+        The scene is physically impossible.
+    UnsupportedScene
+        The papers hold no adhesion model for this gripper.
+    """
+    from dataclasses import replace
+
+    from model import InvalidParameter, predict
+    from rig.errors import FileError
+
+    bound = refuse_unmodelled(scene, source, rigid_bound=rigid_bound)
+    if points < 16:
+        raise FileError(f"--points {points}: a profile needs at least 16 points")
+    try:
+        prediction = predict(scene.parameters(pressure_kPa), model, points=points)
+    except InvalidParameter as error:
+        raise FileError(f"scene {source}: {error}") from error
+    if bound:
+        return replace(prediction, warnings=(*prediction.warnings, bound))
+    return prediction
+
+
+def refuse_unmodelled(scene: Scene, source: str, *, rigid_bound: bool) -> str | None:
+    """Return the label a prediction of this gripper must carry, if any.
+
+    Raises
+    ------
+    UnsupportedScene
+        The papers hold no adhesion model for this gripper.
+    """
+    from model import UnsupportedScene
+
+    kind = scene.gripper.kind
+    if kind == "rigid":
+        return None
+    if kind == "soft" and rigid_bound:
+        return "bound, not a prediction: the rigid gripper's model stands in for the soft one"
+    remedy = {
+        "soft": "--rigid-bound predicts the rigid gripper instead, as a labelled bound",
+        "punch": "a rigid punch pulls off all fibres at once; analyse its recordings instead",
+    }[kind]
+    raise UnsupportedScene(
+        f"scene {source}: gripper.kind = {kind!r} has no adhesion model in the papers. Remedy: {remedy}."
+    )
+
+
+def as_json(prediction: Prediction, *, profile: bool) -> dict[str, Any]:
+    """Return the object of ``--json``; undefined features are null."""
+    result: dict[str, Any] = {"model": prediction.model, "outcome": prediction.outcome.value}
+    result.update({f"{name}_{unit}": number(getattr(prediction, name)) for name, unit in FEATURES.items()})
+    result["numerical_error"] = {
+        f"{name}_{unit}": number(prediction.numerical_error.get(name, math.nan)) for name, unit in FEATURES.items()
+    }
+    result["runtime_s"] = prediction.runtime_s
+    result["assumptions"] = dict(prediction.assumptions)
+    result["warnings"] = list(prediction.warnings)
+    result["jumps"] = [
+        {
+            "position_m": jump.position,
+            "radius_before_m": jump.radius_before,
+            "radius_after_m": jump.radius_after,
+            "force_before_N": jump.force_before,
+            "force_after_N": jump.force_after,
+        }
+        for jump in prediction.jumps
+    ]
+    if profile:
+        result.update({f"{name}_{unit}": getattr(prediction, name).tolist() for name, unit in PROFILE.items()})
+    return result
+
+
+def number(value: float) -> float | None:
+    """Return a finite float, or None for JSON's null."""
+    return float(value) if math.isfinite(value) else None
+
+
+def as_text(prediction: Prediction, title: str, *, profile: bool) -> str:
+    """Return the answer in words, lengths in mm."""
+    lines = [f"{title}: {prediction.outcome.value} ({prediction.model})"]
+    if math.isfinite(prediction.pull_off_force):
+        error = prediction.numerical_error
+        lines += [
+            f"  F_p  {prediction.pull_off_force:.6f} N   (+- {error.get('pull_off_force', math.nan):.1e} N numerically)",
+            f"  D_p  {prediction.pull_off_distance * 1e3:.6f} mm  "
+            f"(+- {error.get('pull_off_distance', math.nan) * 1e3:.1e} mm numerically)",
+            f"  z_r at F_p     {prediction.retraction_at_pull_off * 1e3:.6f} mm",
+            f"  F_r = 0        at z = {prediction.zero_force_position * 1e3:.6f} mm",
+            f"  detachment     at z = {prediction.detachment_position * 1e3:.6f} mm, "
+            f"r = {prediction.detachment_radius * 1e3:.6f} mm",
+        ]
+    lines += [
+        f"  jump           at z = {jump.position * 1e3:.6f} mm, r = {jump.radius_before * 1e3:.4f} -> "
+        f"{jump.radius_after * 1e3:.4f} mm"
+        for jump in prediction.jumps
+    ]
+    lines += [f"  note: {warning}" for warning in prediction.warnings]
+    lines.append("  " + "; ".join(f"{name}: {choice}" for name, choice in prediction.assumptions.items()))
+    lines.append(f"  run time {prediction.runtime_s * 1e3:.2f} ms")
+    if profile:
+        lines += ["retraction_m\tforce_N\tpressure_Pa\tcontact_radius_m"]
+        columns = [getattr(prediction, name) for name in PROFILE]
+        lines += ["\t".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
+    return "\n".join(lines)
