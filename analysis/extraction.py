@@ -59,6 +59,7 @@ class Extraction:
     release_separation: float = field(init=False)
     peak: float = field(init=False)
     peak_fit: LocalFit = field(init=False)
+    peak_shift: float = field(init=False)
 
     def set(self, **values: float) -> None:
         """Store features by their registered names."""

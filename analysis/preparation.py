@@ -104,7 +104,7 @@ def tare(work: Extraction) -> Details:
     work.detached = _rough_detachment(work, smooth, level, noise.of_mean(width))
     after = _after_detachment(work, margin)
     windows = [before] if after is None else [before, after]
-    work.baseline = _fit_line(run.force, windows)
+    work.baseline = fit_line(run.force, windows)
     times = np.arange(run.force.size, dtype=np.float64)
     work.force = run.force - work.baseline(times)
     residual = np.concatenate([_without_trend(run.force[slice(*window)]) for window in windows])
@@ -157,8 +157,8 @@ def _after_detachment(work: Extraction, margin: int) -> tuple[int, int] | None:
     return (start, work.windows.end) if work.windows.end - start >= margin else None
 
 
-def _fit_line(force: Array, windows: list[tuple[int, int]]) -> np.polynomial.Polynomial:
-    """Least squares over block means; every part of the record counts by its length."""
+def fit_line(force: Array, windows: list[tuple[int, int]], degree: int = 1) -> np.polynomial.Polynomial:
+    """Fit block means by least squares; every part of the record counts by its length."""
     places, means = [], []
     for start, stop in windows:
         length = max(1, (stop - start) // 200)
@@ -169,8 +169,8 @@ def _fit_line(force: Array, windows: list[tuple[int, int]]) -> np.polynomial.Pol
         [np.full(p.size, np.sqrt((stop - start) / p.size)) for p, (start, stop) in zip(places, windows, strict=True)]
     )
     where = np.concatenate(places)
-    fit = np.polynomial.Polynomial.fit(where, np.concatenate(means), 1, w=weights)
-    return fit.convert()
+    fit = np.polynomial.Polynomial.fit(where, np.concatenate(means), degree, w=weights)
+    return fit.convert() if degree == 1 else fit
 
 
 @extraction_step("compliance", title="Separation", after=("tare",))

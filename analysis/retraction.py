@@ -6,7 +6,7 @@ import numpy as np
 
 from analysis.errors import FeatureMissing
 from analysis.extraction import Details, Extraction, extraction_step
-from analysis.numerics import Array, Noise, find_jumps, fit_around, running_mean
+from analysis.numerics import Array, LocalFit, Noise, find_jumps, fit_around, fit_window, running_mean
 from analysis.preparation import SMOOTHING, require_adhesion
 
 
@@ -169,6 +169,7 @@ def pull_off(work: Extraction) -> Details:
     at_jump = any(abs(work.peak - jump.start) <= 1 for jump in work.jumps)
     bias = abs(fit.slope(work.peak)) / 2 if at_jump else abs(fit.curvature(work.peak)) / 24
     separation = work.at(work.run.height, work.peak) + work.run.sensors.compliance * value
+    work.peak_shift = _peak_shift(work, fit)
     work.set(
         pull_off_force_N=-value,
         retraction_at_pull_off_m=separation - work.zero_separation,
@@ -180,6 +181,14 @@ def pull_off(work: Extraction) -> Details:
         "index": work.peak,
         "fit": fit,
     }
+
+
+def _peak_shift(work: Extraction, fit: LocalFit) -> float:
+    """How far the peak moves, samples, when only the middle half of the window is fitted: what the cubic cannot follow."""
+    half = max(8, (fit.stop - fit.start) // 4)
+    start, stop = max(fit.start, int(work.peak) - half), min(fit.stop, int(work.peak) + half + 1)
+    narrow, _, _ = fit_window(work.force, start, stop, 3)
+    return narrow.minimum()[0] - work.peak
 
 
 def _side_of_jump(work: Extraction, index: int, left: int, right: int) -> tuple[int, int, int]:

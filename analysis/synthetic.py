@@ -39,10 +39,12 @@ class Imperfections:
         White noise of one sample.
     colour
         Correlation of successive force samples' noise (AR(1) coefficient), 0 for white.
-    drift
-        Drift of the zero of force, N/s.
+    drift, wander
+        Drift of the zero of force, N/s, and the amplitude of its slow waves (about 200, 600 and 1800 s), N.
     creep
         Share of the present load that the cell adds, slowly (60 s): load-cell creep.
+    bow
+        What the calibration line is out by under tension and under compression, N.
     force_gain, pressure_gain, position_gain
         Errors of the calibrations.
     pressure_offset
@@ -57,7 +59,9 @@ class Imperfections:
     pressure_noise: float = 15.0
     colour: float = 0.0
     drift: float = 0.0
+    wander: float = 0.0
     creep: float = 0.0
+    bow: tuple[float, float] = (0.0, 0.0)
     force_gain: float = 0.0
     pressure_gain: float = 0.0
     pressure_offset: float = 0.0
@@ -124,7 +128,10 @@ def pull_off_run(
         start += part.size
     time = np.arange(force.size) / test.rate
     measured = force + flaws.creep * _creep(force, test.rate)
-    measured = measured * (1 + flaws.force_gain) + 0.05 + flaws.drift * time + _noise(generator, force.size, flaws)
+    measured = measured + np.where(force < 0, *flaws.bow) * np.tanh(50 * np.abs(force) / test.preload)
+    measured = (
+        measured * (1 + flaws.force_gain) + 0.05 + _drift(generator, time, flaws) + _noise(generator, force.size, flaws)
+    )
     if flaws.resolution:
         measured = np.round(measured / flaws.resolution) * flaws.resolution
     run = Run(
@@ -197,6 +204,14 @@ def _segments(
         ("pull-off", tail, snap, still(tail.size, pressure_up[-1])),
         ("return", back, zero(back.size), still(back.size, pressure_up[-1])),
     ]
+
+
+def _drift(generator: np.random.Generator, time: Array, flaws: Imperfections) -> Array:
+    drift = flaws.drift * time
+    for period in (197.0, 611.0, 1789.0):
+        phase = generator.uniform(0, 2 * np.pi)
+        drift = drift + flaws.wander * generator.normal() * np.sin(2 * np.pi * time / period + phase)
+    return np.asarray(drift, dtype=np.float64)
 
 
 def _creep(force: Array, rate: float) -> Array:
