@@ -1,0 +1,115 @@
+"""Transducer Techniques GSO load cells: recorded volts (or mV/V) to newtons.
+
+Untared: interlocks act on what the cell really carries, fixture included. A tare is the sequence's affair and is kept
+apart from the calibration. Compression is positive, tension (adhesion, a hung weight) negative.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.calibration import Calibration, InvalidCalibration
+from drivers.flags import Array, Reading, SensorFlags
+
+GRAM_FORCE = 9.80665e-3
+"""N."""
+
+CAPACITIES = {"GSO-25": 25 * GRAM_FORCE, "GSO-500": 500 * GRAM_FORCE, "GSO-1K": 1000 * GRAM_FORCE}
+"""N; the models' names are their capacities in grams."""
+
+_LOADS = ((0.8, SensorFlags.HIGH_LOAD), (1.0, SensorFlags.OVER_RANGE), (1.2, SensorFlags.OVERLOAD))
+
+
+@dataclass(frozen=True, slots=True)
+class LoadCell:
+    """One load cell on one channel.
+
+    Attributes
+    ----------
+    name
+        The cell as the operator knows it.
+    capacity
+        N.
+    calibration
+        Its record, into N; the slope carries the magnitude, ``compression_positive`` the direction.
+    minimum, maximum
+        Rails of the channel, in the recorded unit: a sample at or beyond them is clipped.
+    compression_positive
+        Whether a load that presses on the specimen raises the recorded signal.
+
+    Raises
+    ------
+    InvalidCalibration
+        The record is not one of a force.
+    ValueError
+        Capacity or rails are impossible.
+    """
+
+    name: str
+    capacity: float
+    calibration: Calibration
+    minimum: float = -10.0
+    maximum: float = 10.0
+    compression_positive: bool = True
+
+    def __post_init__(self) -> None:
+        if self.calibration.unit != "N":
+            raise InvalidCalibration(
+                self.name,
+                f"calibration {self.calibration.id} is in {self.calibration.unit}, not N.",
+                "use the cell's own.",
+            )
+        if not (np.isfinite(self.capacity) and self.capacity > 0):
+            raise ValueError(f"{self.name}: capacity {self.capacity} N must be positive")
+        if not self.minimum < self.maximum:
+            raise ValueError(f"{self.name}: minimum {self.minimum} is not below maximum {self.maximum}")
+
+    @classmethod
+    def gso(
+        cls,
+        model: str,
+        calibration: Calibration,
+        *,
+        minimum: float = -10.0,
+        maximum: float = 10.0,
+        compression_positive: bool = True,
+    ) -> LoadCell:
+        """Return a GSO-25, GSO-500 or GSO-1K."""
+        if model not in CAPACITIES:
+            raise ValueError(f"load cell model {model!r} is none of {', '.join(CAPACITIES)}")
+        return cls(model, CAPACITIES[model], calibration, minimum, maximum, compression_positive)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Lowest and highest force the channel's rails allow, N; a limit outside of it can never be seen."""
+        ends = self._force(np.array([self.minimum, self.maximum]))
+        return float(ends.min()), float(ends.max())
+
+    def convert(self, recorded: Array) -> Reading:
+        """Return the untared force (n,) in N and what was wrong; sample by sample, so frames may be cut anyhow."""
+        return Reading(self._force(recorded), self._check(recorded))
+
+    def _force(self, recorded: Array) -> Array:
+        sign = 1.0 if self.compression_positive else -1.0
+        force: Array = recorded * (sign * self.calibration.slope) + sign * self.calibration.intercept
+        return force
+
+    def _check(self, recorded: Array) -> SensorFlags:
+        """The extremes tell everything: the conversion is a straight line."""
+        if not recorded.size:
+            return SensorFlags.NONE
+        extremes = np.array([np.minimum.reduce(recorded), np.maximum.reduce(recorded)])
+        low, high = extremes.tolist()
+        if not (math.isfinite(low) and math.isfinite(high)):
+            return SensorFlags.INVALID
+        load = max(map(abs, self._force(extremes).tolist())) / self.capacity
+        flags = SensorFlags.NONE
+        for limit, flag in _LOADS:
+            if load > limit:
+                flags |= flag
+        if low <= self.minimum or high >= self.maximum:
+            flags |= SensorFlags.CLIPPED
+        return flags
