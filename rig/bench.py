@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -66,7 +67,7 @@ class CalibrationSection(Section):
 
     id: str
     certificate: str
-    date: str
+    date: date
     operator: str
     serial: str
     slope: float
@@ -84,7 +85,8 @@ class ForceSection(Section):
     capacity_N: Annotated[float, Field(gt=0, le=1000)]
     readout: Literal["amplified", "bridge"] = "amplified"
     range_V: Annotated[float, Field(gt=0, le=20)] = 10.0
-    terminal: Literal["default", "rse", "nrse", "diff"] = "default"
+    range_mV_V: Annotated[float, Field(gt=0, le=25)] = 3.0
+    terminal: Literal["default", "rse", "diff"] = "default"
     excitation_V: Annotated[float, Field(gt=0, le=10)] = 2.5
     bridge_ohm: Annotated[float, Field(gt=0)] = 350.0
     compression_positive: bool = True
@@ -93,14 +95,24 @@ class ForceSection(Section):
     calibration: CalibrationSection
 
 
+class ZeroSection(Section):
+    """``[pressure.zero]``: the sensor's reading with its port open to the room; ``rig doctor`` measures it."""
+
+    offset_Pa: Annotated[float, Field(ge=-1200, le=1200)]
+    noise_Pa: Annotated[float, Field(ge=0)]
+    samples: Annotated[int, Field(gt=0)]
+    time: datetime
+    temperature_C: float | None = None
+
+
 class PressureSection(Section):
     """``[pressure]``: Honeywell HSC, ratiometric, its supply on a channel of its own."""
 
     signal_channel: str
     supply_channel: str
     sensor: str = "HSCSANN600MDAA5"
-    terminal: Literal["default", "rse", "nrse", "diff"] = "default"
-    zero_offset_Pa: Annotated[float, Field(ge=-1200, le=1200)] = 0.0
+    terminal: Literal["default", "rse", "diff"] = "default"
+    zero: ZeroSection | None = None
     calibration: CalibrationSection | None = None
 
 

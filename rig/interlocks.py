@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import StageStatus
+from rig.bench import Bench
 from rig.errors import Interlock
 
 Array = NDArray[np.float64]
@@ -34,6 +35,18 @@ class Limits:
     travel: tuple[float, float]
     pressure: tuple[float, float] | None = None
     lag: float = 0.5
+
+
+def limits_of(bench: Bench, travel: tuple[float, float], uses_pressure: bool) -> Limits:
+    """Return a bench's limits for a run with this travel (m)."""
+    pressure = (bench.limits.pressure_low_kPa * 1e3, bench.limits.pressure_high_kPa * 1e3)
+    return Limits(
+        compression=bench.limits.compression_N,
+        tension=bench.limits.tension_N,
+        travel=travel,
+        pressure=pressure if uses_pressure else None,
+        lag=bench.limits.lag_s,
+    )
 
 
 class Interlocks:

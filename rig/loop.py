@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import SensorFault
 from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage, StageStatus
 from rig.errors import Interlock, StoppedByOperator
 from rig.interlocks import Interlocks
@@ -30,13 +31,11 @@ class Converter(Protocol):
     """Volts to SI, and whether they can be believed."""
 
     def convert(self, volts: Array) -> tuple[Array, Array | None]:
-        """Return force (N, untared, compression positive) and pressure (Pa gauge) or ``None``.
+        """Return force (N, untared, compression positive) and pressure (Pa gauge) or ``None``."""
+        ...
 
-        Raises
-        ------
-        SensorFault
-            The signal cannot be true.
-        """
+    def check(self) -> None:
+        """Raise ``SensorFault`` if the frame converted last cannot be true."""
         ...
 
 
@@ -216,12 +215,13 @@ class Loop:
         began = time.perf_counter()
         force, pressure = self._converter.convert(volts)
         try:
+            self._converter.check()
             self._interlocks.check_signals(force, pressure)
-        except Interlock as error:
+        except (Interlock, SensorFault):
             self._instruments.stage.emergency_stop()
             self.interlock_latency = time.perf_counter() - began
             self._keep_last(volts, force, pressure)
-            raise error from None
+            raise
         return force, pressure
 
     def _keep_last(self, volts: Array, force: Array, pressure: Array | None) -> None:

@@ -170,7 +170,16 @@ def as_run(recording: Recording) -> Run:
             if isinstance(value, int | float | str) and not isinstance(value, bool)
         },
         complete=recording.ending is not None and recording.ending[1] == 0,
+        pump_volume=_pump_volume(recording),
     )
+
+
+def _pump_volume(recording: Recording) -> NDArray[np.float64] | None:
+    """Return the volume the pump has displaced at each sample, m^3, linear between its polls."""
+    if recording.pump is None or not len(recording.pump):
+        return None
+    samples = np.arange(recording.force.size)
+    return np.interp(samples, recording.pump["sample"], recording.pump["volume_m3"])
 
 
 def sensors(bench: Bench) -> Sensors:

@@ -22,7 +22,7 @@ from sequences.frame import Frame
 Array = NDArray[np.float64]
 
 
-class EndOfRecording(Exception):  # noqa: N818 - the ordinary end of a replay, not an error
+class EndOfRecording(Exception):
     """The recording holds no further frame."""
 
 

@@ -22,7 +22,7 @@ from rig.check import check
 from rig.commanded import CommandedPump, CommandedStage
 from rig.errors import Refused, RigError
 from rig.instruments import Opened, open_instruments
-from rig.interlocks import Interlocks, Limits
+from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
 from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
 from rig.protocols import build_steps
@@ -61,6 +61,7 @@ class Request:
     seed: int = 0
     speed: float | None = None
     wire: bool = True
+    live: bool = True
     faults: Faults | None = None
     observers: Iterable[Observer] = ()
     controls: Controls = field(default_factory=Controls)
@@ -121,7 +122,7 @@ def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
         where = "" if f"step {reporter.step}" in str(error) else f" (in step {reporter.step})"
         reporter.event(kind, f"{error}{where}")
         if loop.interlock_latency is not None:
-            reporter.event("note", f"stop sent {loop.interlock_latency * 1e3:.2f} ms after the frame was read")
+            reporter.event("timing", f"stop sent {loop.interlock_latency * 1e3:.2f} ms after the frame was read")
         return Ending(f"{error}{where}", int(getattr(error, "exit_code", 1)), loop.samples)
     return Ending("done", 0, loop.samples)
 
@@ -146,17 +147,7 @@ def _loop(
 ) -> Loop:
     bench = request.bench
     travel = opened.stage.travel if recorder is not None else (-float("inf"), float("inf"))
-    interlocks = Interlocks(
-        Limits(
-            compression=bench.limits.compression_N,
-            tension=bench.limits.tension_N,
-            travel=travel,
-            pressure=None
-            if opened.pump is None
-            else (bench.limits.pressure_low_kPa * 1e3, bench.limits.pressure_high_kPa * 1e3),
-            lag=bench.limits.lag_s,
-        )
-    )
+    interlocks = Interlocks(limits_of(bench, travel, opened.pump is not None))
     frame_samples = max(1, round(bench.daq.frame_ms * 1e-3 * opened.daq.rate))
     return Loop(
         instruments,

@@ -1,0 +1,124 @@
+"""``rig run``: take a scene through its sequence, record it, and show the prediction beside the measurement."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rig.observe import Ending
+    from rig.session import Request
+
+DEFAULT_SCENE = "sphere-60mm-low"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", nargs="?", default=DEFAULT_SCENE, help="scene file, or the name of one that ships")
+    parser.add_argument("--bench", type=Path, help="bench file; without one everything is emulated")
+    parser.add_argument("--out", type=Path, help="recording to write (default: recordings/<scene>-<time>.h5)")
+    parser.add_argument("--seed", type=int, default=0, help="emulated bench: which specimen and which noise")
+    parser.add_argument("--speed", default="max", help="emulated bench: times real time, or max (default)")
+    parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
+    parser.add_argument("--faults", type=Path, help="emulated bench: fault script")
+    parser.add_argument("--repeat", type=int, default=1, help="how many tests in a row")
+    parser.add_argument("--console", action="store_true", help="watch and command the run in the console's window")
+    parser.add_argument("--link", action="store_true", help="let consoles attach")
+    parser.add_argument("--no-live", action="store_true", help="no live prediction")
+    parser.add_argument("--no-picture", action="store_true", help="no analysis and no picture at the end")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the scene once or several times; return the first failure's exit code."""
+    if arguments.console:
+        from rig.commands import console
+
+        return console.run_with_console(arguments)
+    for repeat in range(1, max(1, arguments.repeat) + 1):
+        request = _request(arguments, repeat)
+        ending = _run_once(request, arguments)
+        if ending.exit_code:
+            return ending.exit_code
+    return 0
+
+
+def _request(arguments: argparse.Namespace, repeat: int) -> Request:
+    from rig.bench import load_bench
+    from rig.errors import FileError
+    from rig.library import find_scene
+    from rig.scene import parse_scene
+    from rig.session import Request
+
+    text, source = find_scene(arguments.scene)
+    scene = parse_scene(text, source)
+    bench, bench_text = load_bench(arguments.bench)
+    if not bench.is_emulated and arguments.speed != "max":
+        raise FileError("--speed: real instruments run in real time. Remedy: leave it out.")
+    request = Request(
+        scene=scene,
+        scene_text=text,
+        bench=bench,
+        bench_text=bench_text,
+        out=_destination(arguments, Path(source).stem, repeat),
+        seed=arguments.seed + repeat - 1,
+        speed=_speed(arguments.speed),
+        wire=not arguments.direct,
+        repeat=repeat,
+        repeats=max(1, arguments.repeat),
+    )
+    if arguments.faults is not None:
+        from rig.commands.emulate import load_faults
+
+        request.faults = load_faults(arguments.faults)
+    return request
+
+
+def _speed(text: str) -> float | None:
+    from rig.errors import FileError
+
+    if text == "max":
+        return None
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = -1.0
+    if not 0 < speed <= 1000:
+        raise FileError(f"--speed {text}: neither max nor a number above 0 and up to 1000. Remedy: e.g. --speed 1.")
+    return speed
+
+
+def _destination(arguments: argparse.Namespace, scene: str, repeat: int) -> Path:
+    from datetime import datetime
+
+    path: Path = arguments.out or Path("recordings") / f"{scene}-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    return path if arguments.repeat <= 1 else path.with_name(f"{path.stem}-{repeat}{path.suffix}")
+
+
+def _run_once(request: Request, arguments: argparse.Namespace) -> Ending:
+    import sys
+
+    from rig.session import run_scene
+    from rig.terminal import Terminal
+
+    observers: list[object] = [Terminal()]
+    if arguments.link:
+        from rig.link import LinkServer
+
+        observers.append(LinkServer(request.controls))
+    request.observers = observers  # type: ignore[assignment]
+    request.live = not arguments.no_live
+    try:
+        ending = run_scene(request)
+    finally:
+        for observer in observers:
+            if hasattr(observer, "close"):
+                observer.close()
+    if ending.exit_code:
+        print(f"rig run: {ending.reason}", file=sys.stderr)
+        print(f"rig run: the recording {request.out} holds the {ending.samples} samples so far.", file=sys.stderr)
+    elif not arguments.no_picture:
+        from rig.summary import summarise
+
+        print(summarise(request.out))
+    return ending

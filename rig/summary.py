@@ -1,0 +1,60 @@
+"""What a run says at its end: the measurement beside the model, in one table and one picture."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from model import ModelError, predict
+from rig.recording import load_run
+
+if TYPE_CHECKING:
+    from analysis.pipeline import Analysis
+    from model.prediction import Prediction
+
+_ROWS = (
+    ("pull-off force F_p", "N", 1.0, "pull_off_force_N", "pull_off_force"),
+    ("pull-off distance D_p", "mm", 1e3, "pull_off_distance_m", "pull_off_distance"),
+    ("retraction at F_p", "mm", 1e3, "retraction_at_pull_off_m", "retraction_at_pull_off"),
+    ("adhesion energy", "mJ", 1e3, "adhesion_energy_J", "adhesion_energy"),
+    ("initial pressure P_0", "kPa", 1e-3, "initial_pressure_Pa", None),
+    ("preload", "N", 1.0, "preload_N", None),
+)
+
+
+def summarise(path: Path, model: str = "cone") -> str:
+    """Analyse a recording, draw its picture beside it, and return the table of measurement and model."""
+    from analysis import analyze
+    from analysis.figures import overview
+
+    run = load_run(path)
+    analysis = analyze(run)
+    prediction: Prediction | None = None
+    note = ""
+    if run.parameters is not None:
+        try:
+            prediction = predict(run.parameters, model)
+        except ModelError as error:
+            note = f"\nno prediction: {error}"
+    picture = path.with_suffix(".png")
+    overview(run, analysis, prediction, picture)
+    return f"{_table(analysis, prediction)}{note}\nrecording  {path}\npicture    {picture}"
+
+
+def _table(analysis: Analysis, prediction: Prediction | None) -> str:
+    model = "" if prediction is None else prediction.model
+    lines = [f"{'':<24}{'measured':>22}{model:>12}{'difference':>12}"]
+    for title, unit, scale, feature, name in _ROWS:
+        quantity = analysis.features.get(feature)
+        if quantity is None:
+            continue
+        measured = f"{quantity.value * scale:.4g} ± {quantity.uncertainty * scale:.2g}"
+        predicted = math.nan if prediction is None or name is None else getattr(prediction, name)
+        beside = "" if math.isnan(predicted) else f"{predicted * scale:.4g}"
+        off = "" if math.isnan(predicted) else f"{(predicted / quantity.value - 1) * 100:+.1f} %"
+        lines.append(f"{f'{title} ({unit})':<24}{measured:>22}{beside:>12}{off:>12}")
+    if prediction is not None:
+        error = prediction.numerical_error.get("pull_off_force", math.nan)
+        lines.append(f"{model}: numerical error of F_p {error:.1e} N, solved in {prediction.runtime_s * 1e3:.2f} ms")
+    return "\n".join(lines)
