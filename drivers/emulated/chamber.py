@@ -31,7 +31,7 @@ class Chamber:
     vented: bool = False
     leak_time: float = 3000.0
     tubing_lag: float = 0.05
-    syringe_diameter: float = 14.57e-3
+    syringe_diameter: float = 14.43e-3
 
     def pressure(self, amount: float, change: float) -> float:
         """Gauge pressure, Pa, by Boyle's law.

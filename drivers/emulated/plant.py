@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ from drivers.emulated.motion import Carriage, Plunger
 from drivers.emulated.noise import Drift, NoiseStream
 from drivers.emulated.specimens import Specimen, State
 from drivers.emulated.truth import Truth
+from drivers.emulated.world import Axis, Syringe
 
 LONGEST_STEP = 0.02
 """s; also how far a quiet world is computed ahead."""
@@ -26,8 +29,14 @@ LONGEST_STEP = 0.02
 SHORTEST_STEP = LONGEST_STEP / 2**12
 """s; a step this short is accepted whatever its error: the world has jumped."""
 
-FAULTS = (("stage", "blocked"), ("pump", "slipping"), ("pressure", "leak"))
-"""Faults of the world itself: the carriage is held fast; the plunger moves no fluid; the chamber leaks (value: s)."""
+ROUND_OFF = 1e-6
+"""Knots closer than this are one, s."""
+
+FAULTS: Mapping[str, Mapping[str, str]] = {
+    "stage": {"blocked": "the carriage is held fast while the trajectory runs on"},
+    "pressure": {"leak": "the chamber leaks with a time constant of `value` seconds"},
+}
+"""Faults of the world itself."""
 
 
 class Knot(NamedTuple):
@@ -74,8 +83,10 @@ class Plant:
         self._epoch_sample = 0
         self._step = LONGEST_STEP
         self._knots: list[Knot] = []
-        self.axis = Carriage(self._now, truth.train.start_position, truth.train.servo_lag, self._settle)
-        self.syringe = Plunger(self._now, truth.chamber.syringe_diameter, self._pressure, self._settle)
+        self._carriage = Carriage(self._now, truth.train.start_position, truth.train.servo_lag, self._settle)
+        self._plunger = Plunger(self._now, truth.chamber.syringe_diameter, self._pressure, self._settle)
+        self.axis: Axis = self._carriage
+        self.syringe: Syringe = self._plunger
         self._knots = [self._first_knot()]
 
     @property
@@ -169,8 +180,8 @@ class Plant:
         duration = time - last.time
         train, chamber = self.truth.train, self._chamber
         amount = chamber.leaked(last.amount, last.state.pressure, duration)
-        height = self.axis.position_at(time) - train.contact_position
-        delivered = self.syringe.delivered_at(time)
+        height = self._carriage.position_at(time) - train.contact_position
+        delivered = self._plunger.delivered_at(time)
         state = self._specimen.step(last.state, duration, height, delivered, amount, chamber, train.stiffness)
         pushed = state.force if state.force > 0.0 else 0.0
         relaxed = pushed + (last.relaxed - pushed) * math.exp(-duration / train.relaxation_time)
@@ -197,8 +208,11 @@ class Plant:
         knots = self._knots
         while knots[-1].time > self._time:
             knots.pop()
-        if knots[-1].time < self._time:
-            knots.append(self._after(knots[-1], self._time))
+        last = knots[-1]
+        if self._time - last.time < ROUND_OFF:
+            knots[-1] = last._replace(time=self._time)
+        else:
+            knots.append(self._after(last, self._time))
 
     def _pressure(self) -> float:
         """Gas pressure now, Pa gauge."""
@@ -216,4 +230,9 @@ class Plant:
 
     def _play_faults(self) -> None:
         """Let the faults of the world begin or end now."""
-        self.axis.block(self.faults.active("stage", "blocked") is not None)
+        self._carriage.block(self.faults.active("stage", "blocked") is not None)
+        leak = self.faults.active("pressure", "leak")
+        chamber = self.truth.chamber if leak is None else replace(self.truth.chamber, leak_time=leak.value or 1.0)
+        if chamber != self._chamber:
+            self._settle()
+            self._chamber = chamber

@@ -31,7 +31,7 @@ class Train:
         Fraction of a compression that relaxes at rest, and its time constant, s.
     """
 
-    stiffness: float = 40e3
+    stiffness: float = 84e3
     contact_position: float = 20e-3
     start_position: float = 22e-3
     servo_lag: float = 3e-3
@@ -102,13 +102,17 @@ class Truth:
             substrate_diameter=diameter if shape == "sphere" else None,
             disk_diameter=diameter if shape == "flat" else None,
             radius=radius,
-            effective_radius=effective_radius * (1 - 0.012 * abs(draw())),
+            effective_radius=min(effective_radius * (1 - 0.012 * abs(draw())), 0.99 * radius),
             youngs_modulus=nominal.youngs_modulus * (1 + 0.02 * draw()),
             thickness=nominal.thickness * (1 + 0.02 * draw()),
             receding=nominal.receding * (1 + 0.03 * draw()),
             advancing=nominal.advancing * math.exp(0.2 * draw()),
             tilt=abs(1.0e-3 + 0.5e-3 * draw()),
         )
-        chamber = Chamber(volume=chamber_volume * (1 + 0.004 * draw()), vented=vented)
-        train = Train(contact_position=20e-3 + 20e-6 * draw(), stiffness=40e3 * (1 + 0.02 * draw()))
+        chamber = Chamber(
+            volume=chamber_volume * (1 + 0.004 * draw()),
+            vented=vented,
+            syringe_diameter=14.43e-3 * (1 + 0.001 * draw()),
+        )
+        train = Train(contact_position=20e-3 + 20e-6 * draw(), stiffness=84e3 * (1 + 0.02 * draw()))
         return cls(specimen, chamber, train)
