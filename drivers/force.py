@@ -94,7 +94,8 @@ class LoadCell:
 
     def _force(self, recorded: Array) -> Array:
         sign = 1.0 if self.compression_positive else -1.0
-        force: Array = recorded * (sign * self.calibration.slope) + sign * self.calibration.intercept
+        with np.errstate(over="ignore"):
+            force: Array = recorded * (sign * self.calibration.slope) + sign * self.calibration.intercept
         return force
 
     def _check(self, recorded: Array) -> SensorFlags:

@@ -353,8 +353,7 @@ class _Service:
 
     def GetChanAttributeDouble(self, request: Any, context: Any) -> dict[str, Any]:
         wanted = self._channel(request)
-        limits = [(limit - wanted.offset) / wanted.gain for limit in (wanted.minimum, wanted.maximum)]
-        span = self._device.module(wanted.physical).range_for(*limits)
+        span = self._device.module(wanted.physical).range_for(*wanted.limits)
         values = {0x17DE: wanted.minimum, 0x17DD: wanted.maximum, 0x1816: -span, 0x1815: span}
         return {"value": _known(values, request.attribute_raw)}
 

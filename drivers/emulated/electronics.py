@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from drivers.calibration import Calibration
 from drivers.daq import BridgeChannel, Channel
 from drivers.emulated.faults import Faults
+from drivers.emulated.noise import NoiseStream
 
 Array = NDArray[np.float64]
 
@@ -98,8 +99,8 @@ class Cell:
     def output(self, force: Array, bridge: bool) -> Array:
         """Return the noise-free signal (V, or mV/V) for a force (N)."""
         sensitivity = (self.bridge_sensitivity if bridge else self.sensitivity) * (1 + self.gain_error)
-        bow = self.linearity * force * (1 - np.abs(force) / self.capacity)
-        return sensitivity * (force + bow + self.zero * self.capacity)
+        straight, bow = sensitivity * (1 + self.linearity), sensitivity * self.linearity / self.capacity
+        return force * (straight - bow * np.abs(force)) + sensitivity * self.zero * self.capacity
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +128,9 @@ class PressureSensor:
 
     def output(self, pressure: Array, supply: Array, noise: Array) -> Array:
         """Return V for a gauge pressure (Pa), the supply (V) and standard normal noise."""
-        part = 0.5 + 0.4 * (1 + self.gain_error) * pressure / self.full_scale + 0.8 * self.offset
-        return supply * np.clip(part + self.noise * noise, *self.clip)
+        part = pressure * (0.4 * (1 + self.gain_error) / self.full_scale)
+        part += self.noise * noise + (0.5 + 0.8 * self.offset)
+        return supply * np.fmin(np.fmax(part, self.clip[0]), self.clip[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +182,12 @@ class Input:
     gain: float = 1.0
     offset: float = 0.0
 
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The range asked for, before scaling: V or mV/V."""
+        low, high = (self.minimum - self.offset) / self.gain, (self.maximum - self.offset) / self.gain
+        return min(low, high), max(low, high)
+
     @classmethod
     def of(cls, channel: Channel) -> Input:
         """Return what a driver's channel asks of the device."""
@@ -220,7 +228,7 @@ class Device:
             )
         if not wanted.minimum < wanted.maximum:
             raise Refusal(-200082, f"Minimum {wanted.minimum} is not less than maximum {wanted.maximum}.")
-        module.range_for((wanted.minimum - wanted.offset) / wanted.gain, (wanted.maximum - wanted.offset) / wanted.gain)
+        module.range_for(*wanted.limits)
 
     def coerce_rate(self, rate: float, channels: int) -> float:
         """Return the next higher sample rate the hardware has (Hz).
@@ -282,55 +290,60 @@ class Electronics:
         faults: Faults | None = None,
         start: int = 0,
     ) -> None:
-        faults = faults or Faults()
-        self._next = start
-        self._rows = [_Row(device, wanted, rate, seed, run, faults) for wanted in inputs]
+        self._faults = Faults() if faults is None else faults
+        self._start = self._next = start
+        self._rows = [_Row(device, wanted, rate, self._faults) for wanted in inputs]
+        column = np.array([[row.noise, row.step, *row.codes, row.gain, row.offset] for row in self._rows]).T[..., None]
+        noise, self._step, self._lowest, self._highest, self._gain, self._offset = column
+        self._scaled = bool(np.any(self._gain != 1) or np.any(self._offset != 0))
+        stream = zlib.crc32(repr((seed, run, [wanted.physical for wanted in inputs])).encode())
+        self._noise = NoiseStream(stream, (*noise[:, 0].tolist(), *[1.0] * len(inputs)))
 
     def digitise(self, truth: Mapping[str, Array]) -> Array:
         """Return what the device delivers (channels, n) for the plant's next n samples."""
-        samples = truth["force"].size
-        volts = np.empty((len(self._rows), samples))
-        for row, line in zip(self._rows, volts, strict=True):
-            row.digitise(truth, self._next, line)
-        self._next += samples
+        start, stop = self._next, self._next + truth["force"].size
+        noise = self._noise.take(start - self._start, stop - self._start)
+        channels = len(self._rows)
+        volts = noise[:channels].copy()  # the converter's own; the rest is for the sensors
+        for i, row in enumerate(self._rows):
+            volts[i] += row.signal(truth, start, noise[channels + i])
+        volts /= self._step
+        np.rint(volts, out=volts)
+        np.fmax(volts, self._lowest, out=volts)
+        np.fmin(volts, self._highest, out=volts)
+        volts *= self._step
+        if self._scaled:
+            volts *= self._gain
+            volts += self._offset
+        self._next = stop
         return volts
 
 
 class _Row:
-    """One input: its sensor, its noise, its converter."""
+    """One input: its sensor, its wire and the settings of its converter."""
 
-    def __init__(self, device: Device, wanted: Input, rate: float, seed: int, run: int, faults: Faults) -> None:
+    def __init__(self, device: Device, wanted: Input, rate: float, faults: Faults) -> None:
         module = device.module(wanted.physical)
-        self._device, self._input, self._faults = device, wanted, faults
-        self._signal = {"force": self._force, "pressure": self._pressure, "supply": self._supply}.get(
+        half_span = module.range_for(*wanted.limits)
+        self.noise = module.noise * half_span
+        self.step = 2 * half_span * module.overrange / 2**module.bits
+        self.codes = (-(2.0 ** (module.bits - 1)), 2.0 ** (module.bits - 1) - 1)
+        self.gain, self.offset = wanted.gain, wanted.offset
+        self._device, self._bridge, self._faults = device, wanted.bridge, faults
+        self._sense = {"force": self._force, "pressure": self._pressure, "supply": self._supply}.get(
             device.wiring.get(wanted.physical, ""), self._open
         )
-        limits = [(limit - wanted.offset) / wanted.gain for limit in (wanted.minimum, wanted.maximum)]
-        half_span = module.range_for(*limits)
-        self._noise = module.noise * half_span
-        self._step = 2 * half_span * module.overrange / 2**module.bits
-        self._codes = (-(2.0 ** (module.bits - 1)), 2.0 ** (module.bits - 1) - 1)
-        self._random = np.random.default_rng([seed, run, zlib.crc32(wanted.physical.encode())])
         self._delay = _Delay(module.filter_samples)
         self._staircase = _Staircase(rate, device.sensor.update_rate)
 
-    def digitise(self, truth: Mapping[str, Array], start: int, out: Array) -> None:
-        noise = self._random.standard_normal((out.size, 2))
-        signal = self._delay(self._signal(truth, start, noise[:, 0]))
-        codes = np.clip(np.rint((signal + self._noise * noise[:, 1]) / self._step), *self._codes)
-        np.multiply(codes, self._step, out=out)
-        out *= self._input.gain
-        out += self._input.offset
+    def signal(self, truth: Mapping[str, Array], start: int, noise: Array) -> Array:
+        """Return what arrives at the converter, V or mV/V."""
+        return self._delay(self._sense(truth, start, noise))
 
     def _force(self, truth: Mapping[str, Array], start: int, noise: Array) -> Array:
-        cell, bridge = self._device.cell, self._input.bridge
-        force = truth["force"]
-        if faults := self._during("force", "over_range", start, force.size):
-            force = force.copy()
-            for part, value in faults:
-                force[part] = value
-        sensitivity = cell.bridge_sensitivity if bridge else cell.sensitivity
-        signal = cell.output(force, bridge) + sensitivity * cell.noise * self._louder("force", start, noise)
+        cell = self._device.cell
+        force = self._changed("force", "over_range", start, truth["force"])
+        signal = cell.output(force + cell.noise * self._louder("force", start, noise), self._bridge)
         for part, _ in self._during("force", "open_wire", start, force.size):
             signal[part] = np.inf
         return signal
@@ -349,20 +362,30 @@ class _Row:
 
     def _supply(self, truth: Mapping[str, Array], start: int, noise: Array) -> Array:
         supply = self._true_supply(truth, start)
-        for part, _ in self._during("supply", "open_wire", start, noise.size):
-            supply[part] = OPEN_INPUT
+        if faults := self._during("supply", "open_wire", start, noise.size):
+            supply = supply.copy()
+            for part, _ in faults:
+                supply[part] = OPEN_INPUT
         return supply
 
     def _open(self, truth: Mapping[str, Array], start: int, noise: Array) -> Array:
         return np.full(noise.size, OPEN_INPUT)
 
     def _true_supply(self, truth: Mapping[str, Array], start: int) -> Array:
-        supply = truth["supply"].copy()
-        for part, value in self._during("supply", "sag", start, supply.size):
-            supply[part] = value
-        for part, _ in self._during("supply", "lost", start, supply.size):
-            supply[part] = 0.0
+        supply = self._changed("supply", "sag", start, truth["supply"])
+        if faults := self._during("supply", "lost", start, supply.size):
+            supply = supply.copy()
+            for part, _ in faults:
+                supply[part] = 0.0
         return supply
+
+    def _changed(self, device: str, kind: str, start: int, values: Array) -> Array:
+        """Return the values, or those the fault script puts in their place."""
+        if faults := self._during(device, kind, start, values.size):
+            values = values.copy()
+            for part, value in faults:
+                values[part] = value
+        return values
 
     def _louder(self, device: str, start: int, noise: Array) -> Array:
         if faults := self._during(device, "noise", start, noise.size):
@@ -372,6 +395,8 @@ class _Row:
         return noise
 
     def _during(self, device: str, kind: str, start: int, samples: int) -> list[tuple[slice, float]]:
+        if not self._faults.scheduled:
+            return []
         spans = self._faults.during(device, kind, start, start + samples)
         return [(slice(first - start, last - start), fault.value) for first, last, fault in spans]
 

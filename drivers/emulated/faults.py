@@ -91,6 +91,11 @@ class Faults:
                     return fault
         return None
 
+    @property
+    def scheduled(self) -> bool:
+        """Whether any fault has, or will have, its time; a cheap question."""
+        return bool(self._starts)
+
     def during(self, device: str, kind: str, start: int, stop: int) -> list[tuple[int, int, Fault]]:
         """Return (first, last + 1, fault) of every fault of this kind that touches samples ``start`` to ``stop - 1``.
 
