@@ -77,7 +77,7 @@ def _open_emulated(request: Request) -> Opened:
         if request.wire:
             endpoints = emulated.endpoints
             connections = {"stage": endpoints.stage, "daq": endpoints.daq}
-            if request.scene.uses_pressure:
+            if endpoints.pump is not None:
                 connections["pump"] = endpoints.pump
             opened = _open_wired(request.bench, request.scene.uses_pressure, emulated.clock, connections)
         else:

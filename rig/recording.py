@@ -179,7 +179,8 @@ def _pump_volume(recording: Recording) -> NDArray[np.float64] | None:
     if recording.pump is None or not len(recording.pump):
         return None
     samples = np.arange(recording.force.size)
-    return np.interp(samples, recording.pump["sample"], recording.pump["volume_m3"])
+    volume: NDArray[np.float64] = np.interp(samples, recording.pump["sample"], recording.pump["volume_m3"])
+    return volume
 
 
 def sensors(bench: Bench) -> Sensors:

@@ -46,9 +46,9 @@ def _table(analysis: Analysis, prediction: Prediction | None) -> str:
     model = "" if prediction is None else prediction.model
     lines = [f"{'':<24}{'measured':>22}{model:>12}{'difference':>12}"]
     for title, unit, scale, feature, name in _ROWS:
-        quantity = analysis.features.get(feature)
-        if quantity is None:
+        if feature not in analysis.features:
             continue
+        quantity = analysis.features[feature]
         measured = f"{quantity.value * scale:.4g} ± {quantity.uncertainty * scale:.2g}"
         predicted = math.nan if prediction is None or name is None else getattr(prediction, name)
         beside = "" if math.isnan(predicted) else f"{predicted * scale:.4g}"

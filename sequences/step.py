@@ -119,7 +119,8 @@ class Motion:
         position, ahead = frame.stage.position, self._look_ahead
         stretch = max(min(self._target - position, ahead), -ahead)
         if self._is_due(frame, position, ahead):
-            self._commanded = position + stretch
+            low, high = self._apparatus.stage.travel
+            self._commanded = min(max(position + stretch, low), high)
             self._apparatus.stage.move_to(self._commanded)
 
     def arrived(self, frame: Frame) -> bool:
