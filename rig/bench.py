@@ -70,10 +70,10 @@ class CalibrationSection(Section):
     date: date
     operator: str
     serial: str
-    slope: float
+    slope: Annotated[float, Field(gt=0)]
     intercept: float = 0.0
-    relative_uncertainty: Annotated[float, Field(ge=0, le=1)]
-    residual: Annotated[float, Field(ge=0)]
+    relative_uncertainty: Annotated[float, Field(gt=0, le=1)]
+    residual: Annotated[float, Field(gt=0)]
     temperature_C: float = 23.0
 
 
@@ -147,6 +147,18 @@ class Bench(Section):
                     f"limits.{key} = {limit:g} is beyond the load cell: {self.force.cell} carries "
                     f"{self.force.capacity_N:g} N, at most 120 % of it ({1.2 * self.force.capacity_N:.3g} N) is allowed"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _is_filled_in(self) -> Bench:
+        texts = {
+            "stage.connection": self.stage.connection,
+            "pump.connection": self.pump.connection if self.pump else "",
+            **{f"force.calibration.{key}": str(value) for key, value in self.force.calibration},
+        }
+        empty = [key for key, text in texts.items() if "FILL" in text]
+        if empty:
+            raise ValueError(f"still to be filled in: {', '.join(empty)}")
         return self
 
     @property

@@ -85,11 +85,26 @@ def run_scene(request: Request) -> Ending:
             _make_ready(request, opened)
             return _recorded(request, opened)
     finally:
-        failures = make_safe(opened.stage, opened.pump, opened.daq)
-        failures += release(opened.stage, opened.pump, opened.daq)
-        opened.shut_down()
-        for failure in failures:
-            print(f"rig: {failure}. Remedy: switch the device off by hand.", file=sys.stderr)
+        _leave(opened)
+
+
+def reference_only(request: Request) -> float:
+    """Reference the stage, park it, and return where it stands, m. Only on the operator's explicit word."""
+    opened = open_instruments(request)
+    try:
+        with _signals(request.controls, opened):
+            reference_stage(request, opened)
+            return opened.stage.status().position
+    finally:
+        _leave(opened)
+
+
+def _leave(opened: Opened) -> None:
+    failures = make_safe(opened.stage, opened.pump, opened.daq)
+    failures += release(opened.stage, opened.pump, opened.daq)
+    opened.shut_down()
+    for failure in failures:
+        print(f"rig: {failure}. Remedy: switch the device off by hand.", file=sys.stderr)
 
 
 def _recorded(request: Request, opened: Opened) -> Ending:

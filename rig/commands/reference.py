@@ -1,0 +1,31 @@
+"""``rig reference``: reference the stage, with the operator's confirmation."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("--bench", type=Path, required=True, help="bench file")
+    parser.add_argument("--path-is-clear", action="store_true", help="confirm without being asked")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Ask, then move: the stage may run its full travel."""
+    from rig.bench import load_bench
+    from rig.errors import Refused
+    from rig.library import find_scene
+    from rig.scene import parse_scene
+    from rig.session import Request, reference_only
+
+    bench, bench_text = load_bench(arguments.bench)
+    if not arguments.path_is_clear:
+        print("The stage will run to its switch, up to its full travel. Take specimen and gripper out of its path.")
+        if input("Type 'clear' when the path is clear: ").strip() != "clear":
+            raise Refused("not confirmed. Nothing has moved.")
+    text, source = find_scene("sphere-60mm-vented")
+    position = reference_only(Request(parse_scene(text, source), text, bench, bench_text, Path()))
+    print(f"referenced; the stage stands at {position * 1e3:.4f} mm")
+    return 0
