@@ -32,7 +32,9 @@ MODELS = ("cone", "cone-2017", "membrane")
 """Names of the adhesion models, as the command line takes them."""
 
 
-def predict(parameters: Parameters, model: str = "cone", *, points: int = 200) -> Prediction:
+def predict(
+    parameters: Parameters, model: str = "cone", *, points: int = 200, contact_stretch: str | None = None
+) -> Prediction:
     """Predict one pull-off test.
 
     Parameters
@@ -43,6 +45,8 @@ def predict(parameters: Parameters, model: str = "cone", *, points: int = 200) -
         One of ``MODELS``.
     points
         Number of points of the returned profile; the features do not depend on it.
+    contact_stretch
+        How the membrane is stretched in contact, for ``membrane`` only: see ``model.membrane_contact``.
 
     Raises
     ------
@@ -58,5 +62,5 @@ def predict(parameters: Parameters, model: str = "cone", *, points: int = 200) -
     if model == "membrane":
         from model import membrane
 
-        return membrane.solve(parameters, points=points)
+        return membrane.solve(parameters, points=points, contact_stretch=contact_stretch or "eml")
     raise InvalidParameter(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")

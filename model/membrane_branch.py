@@ -1,0 +1,227 @@
+"""Following equilibrium states of the membrane: to a scene, along the peeling branch, along the pinned part.
+
+Every curve is followed by its natural coordinate (load fraction, width ln(R_0 / a) of the annulus, height of the rim),
+with a secant predictor and a step that adapts; only the pull-off fold is a maximum of height and no fold in the width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.errors import NotConverged
+from model.membrane_contact import Surface
+from model.membrane_equilibrium import Annulus, Closure, Solved, relative_size, release_slope, shape, solve, strip
+
+Array = NDArray[np.float64]
+
+COARSE_ORDER = 10
+SMALLEST_CONTACT = 3.9
+"""Width ln(R_0 / a) to which a branch is followed at first, a = 0.02 R_0."""
+LAST_WIDTH = 14.0
+LARGEST_SURPRISE = 0.5
+"""How far a state may lie from its prediction before the step counts as a leap to another solution."""
+
+
+class Line(NamedTuple):
+    """Solved states (n, m) along a rising coordinate (n,)."""
+
+    coordinate: Array
+    state: Array
+
+    def guess(self, coordinate: Array) -> Array:
+        """Return states interpolated linearly, as Newton's first guess."""
+        after = np.clip(np.searchsorted(self.coordinate, coordinate), 1, self.coordinate.size - 1)
+        low, high = self.coordinate[after - 1], self.coordinate[after]
+        fraction = ((coordinate - low) / (high - low))[:, None]
+        return (1 - fraction) * self.state[after - 1] + fraction * self.state[after]
+
+
+class Counter:
+    """Counts evaluated states."""
+
+    def __init__(self) -> None:
+        self.states = 0
+
+    def note(self, solved: Solved) -> Solved:
+        """Add the cost of one solution and hand it on."""
+        self.states += solved.evaluations
+        return solved
+
+
+SolveAt = Callable[[float, Array], Array | None]
+
+
+def follow(solve_at: SolveAt, start: float, state: Array, stop: float, *, step: float, smallest: float) -> Line:
+    """Follow a solution from ``start`` towards ``stop``; the line ends early where no step succeeds.
+
+    ``solve_at`` returns the state at a coordinate from its prediction, or ``None``.
+    """
+    direction = 1.0 if stop > start else -1.0
+    places, states = [start], [state]
+    while (stop - places[-1]) * direction > 0 and step > smallest:
+        place = places[-1] + direction * min(step, abs(stop - places[-1]))
+        solved = solve_at(place, _predict(places, states, place))
+        if solved is None:
+            step /= 2.5
+        else:
+            places.append(place)
+            states.append(solved)
+            step *= 1.5
+    order = slice(None, None, 1 if direction > 0 else -1)
+    return Line(np.array(places)[order], np.concatenate(states)[order])
+
+
+def _predict(places: list[float], states: list[Array], place: float) -> Array:
+    if len(places) == 1:
+        return states[-1]
+    fraction = (place - places[-1]) / (places[-1] - places[-2])
+    return states[-1] + fraction * (states[-1] - states[-2])
+
+
+def release_state(annulus: Annulus, width: float, counter: Counter, order: int = COARSE_ORDER) -> Array | None:
+    """Return the state (1, m) that peels at the given width, reached from a strip by raising curvature and pressure."""
+    return _raise_load(annulus, width, Closure.RELEASE, 0.0, counter, order)
+
+
+def pinned_state(annulus: Annulus, width: float, height: float, counter: Counter) -> Array | None:
+    """Return the state (1, m) with the contact line held at the given width and the rim at ``height``."""
+    return _raise_load(annulus, width, Closure.HEIGHT, height, counter, COARSE_ORDER)
+
+
+def _raise_load(
+    annulus: Annulus, width: float, closure: Closure, height: float, counter: Counter, order: int
+) -> Array | None:
+    widths = np.array([width])
+    flat = _at_fraction(annulus, 0.0)
+    start = counter.note(solve(flat, widths, strip(annulus.work, order), iterations=20))
+    if not start.converged[0]:
+        return None
+    rest = float(shape(flat, widths, start.state).height[0])
+
+    def solve_at(fraction: float, guess: Array) -> Array | None:
+        target = (1 - fraction) * rest + fraction * height
+        return _accepted(_at_fraction(annulus, fraction), widths, guess, closure, target, counter)
+
+    line = follow(solve_at, 0.0, start.state, 1.0, step=0.5, smallest=2e-3)
+    return line.state[-1:] if line.coordinate[-1] == 1.0 else None
+
+
+def _at_fraction(annulus: Annulus, fraction: float) -> Annulus:
+    """Return the scene with curvature, pressure and gas stiffness scaled: from a vented flat to the whole."""
+    if fraction == 1.0:
+        return annulus
+    gas = annulus.gas
+    measured = None if gas.measured is None else (gas.measured[0], fraction * gas.measured[1])
+    looser = np.inf if fraction == 0.0 else 1 / fraction
+    free = gas.free_volume if fraction == 0.0 else gas.free_volume * looser
+    eased = replace(
+        gas, pressure=gas.pressure * fraction, volume=gas.volume * looser, free_volume=free, measured=measured
+    )
+    return replace(annulus, surface=Surface(annulus.surface.curvature * fraction), gas=eased)
+
+
+def _accepted(
+    annulus: Annulus,
+    widths: Array,
+    guess: Array,
+    closure: Closure,
+    target: float,
+    counter: Counter,
+    *,
+    surprise: float = LARGEST_SURPRISE,
+) -> Array | None:
+    solved = counter.note(solve(annulus, widths, guess, closure=closure, target=target, iterations=9))
+    if not solved.converged[0]:
+        return None
+    if relative_size(solved.state, solved.state - guess, widths)[0] > surprise:
+        return None
+    if closure is Closure.RELEASE and not release_slope(annulus, widths, solved.state)[0] > 0:
+        return None  # a lower root: z_eq is the largest
+    return solved.state
+
+
+def release_branch(annulus: Annulus, width: float, height: float, counter: Counter) -> Line | None:
+    """Return the peeling branch from the widest contact, ``width`` = ln(R_0 / r_i), to a small one.
+
+    The widest contact need not have a peeling state: stored stretch or suction may peel it at any height. Then smaller
+    contacts are tried and the branch is followed back to where it ends. ``height`` is z_0. ``None``: no contact that
+    could be solved at z_0 holds there.
+
+    Raises
+    ------
+    NotConverged
+        Not even pinned states at z_0 could be solved.
+    """
+    starts = width + np.array([0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6])
+    for start in map(float, starts):
+        state = release_state(annulus, start, counter)
+        if state is not None:
+            return _both_ways(annulus, start, state, width, counter)
+    solved = 0
+    for start in map(float, starts):
+        pinned = pinned_state(annulus, start, height, counter)
+        if pinned is None:
+            continue
+        solved += 1
+        state = _lift_until_release(annulus, start, pinned, height, counter)
+        if state is not None:
+            return _both_ways(annulus, start, state, width, counter)
+    if solved == 0:
+        raise NotConverged("membrane: no state at the start of retraction could be solved; the scene is too extreme")
+    return None
+
+
+def _lift_until_release(annulus: Annulus, width: float, state: Array, height: float, counter: Counter) -> Array | None:
+    """Raise the rim of a pinned state until it peels; ``None`` if it peels at once, or never within R_0."""
+    line = pinned_line(annulus, width, state, height, height + 1.0, counter)
+    widths = np.full(line.coordinate.size, width)
+    lifted = shape(annulus, widths, line.state)
+    holds = (lifted.release < annulus.work) | (lifted.peel_angle <= 0)
+    if not holds[0] or holds.all():
+        return None
+    return _accepted(
+        annulus, widths[:1], line.state[[int(np.argmin(holds))]], Closure.RELEASE, 0.0, counter, surprise=np.inf
+    )
+
+
+def _both_ways(annulus: Annulus, start: float, state: Array, width: float, counter: Counter) -> Line:
+    def solve_at(place: float, guess: Array) -> Array | None:
+        return _accepted(annulus, np.array([place]), guess, Closure.RELEASE, 0.0, counter)
+
+    line = follow(solve_at, start, state, max(SMALLEST_CONTACT, start + 1), step=0.1, smallest=1e-5)
+    if start > width:
+        line = _join(follow(solve_at, start, state, width, step=0.05, smallest=2e-4), line)
+    while _still_rising(annulus, line) and line.coordinate[-1] < LAST_WIDTH:
+        end = line.coordinate[-1]
+        further = follow(solve_at, end, line.state[-1:], end + 2, step=0.2, smallest=2e-3)
+        if further.coordinate.size == 1:
+            break
+        line = _join(line, further)
+    return line
+
+
+def _join(first: Line, second: Line) -> Line:
+    return Line(
+        np.concatenate([first.coordinate[:-1], second.coordinate]), np.concatenate([first.state[:-1], second.state])
+    )
+
+
+def _still_rising(annulus: Annulus, line: Line) -> bool:
+    height = shape(annulus, line.coordinate, line.state).height
+    return bool(height[-1] >= height.max())
+
+
+def pinned_line(annulus: Annulus, width: float, state: Array, top: float, bottom: float, counter: Counter) -> Line:
+    """Return the pinned states from the rim height ``top`` of a known state down (or up) to ``bottom``."""
+    widths = np.array([width])
+
+    def solve_at(height: float, guess: Array) -> Array | None:
+        return _accepted(annulus, widths, guess, Closure.HEIGHT, height, counter)
+
+    span = abs(top - bottom)
+    return follow(solve_at, top, state, bottom, step=span / 6, smallest=1e-4 * span)

@@ -1,0 +1,251 @@
+"""The path of the contact from z_0 to detachment, as Chebyshev series, and the features read off it. Scaled units."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import Chebyshev
+from numpy.typing import NDArray
+
+from model.errors import NotConverged
+from model.membrane_branch import Counter, Line, pinned_line
+from model.membrane_equilibrium import Annulus, Closure, node_positions, resample, shape, solve
+
+Array = NDArray[np.float64]
+
+PANEL_SIZES = (16, 32)
+"""Points of a panel, less one. A panel that the larger number does not resolve is halved."""
+DEEPEST = 12
+"""How often a panel may be halved: near slack states height and force turn within a narrow range."""
+
+
+class Panel(NamedTuple):
+    """States at Chebyshev points of a coordinate: ln(R_0 / a) where the contact peels, z where it is pinned.
+
+    ``height``, ``pull`` (over 2 pi) and ``pressure`` are series in the coordinate; ``tail`` is the size of their last
+    terms relative to the largest.
+    """
+
+    coordinate: Array
+    width: Array
+    state: Array
+    height: Chebyshev
+    pull: Chebyshev
+    pressure: Chebyshev
+    tail: float
+    pinned: bool
+
+    def guess(self, coordinate: Array) -> Array:
+        """Return states near the given coordinates."""
+        return Line(self.coordinate, self.state).guess(coordinate)
+
+
+class Piece(NamedTuple):
+    """A stable stretch of the path on which the rim rises: a panel between two of its coordinates."""
+
+    panel: Panel
+    begin: float
+    end: float
+
+
+class Place(NamedTuple):
+    """A point of the path: its piece and the coordinate there."""
+
+    piece: Piece
+    coordinate: float
+
+    @property
+    def height(self) -> float:
+        """Height of the rim."""
+        return float(self.piece.panel.height(self.coordinate))
+
+    @property
+    def pull(self) -> float:
+        """Pull on the substrate, over 2 pi."""
+        return float(self.piece.panel.pull(self.coordinate))
+
+    @property
+    def width(self) -> float:
+        """ln(R_0 / a)."""
+        return float(self.piece.panel.width[0]) if self.piece.panel.pinned else self.coordinate
+
+
+class Features(NamedTuple):
+    """What is read off a path; ``zero`` is ``None`` where the force is tensile from the start."""
+
+    zero: Place | None
+    start: Place
+    onset: Place
+    peak: Place
+    detachment: Place
+    energy: float
+
+
+class Resolution(NamedTuple):
+    """How well a line is to be resolved: order of the shapes, relative size of the last terms of the series."""
+
+    order: int
+    tail: float
+
+
+def peel_panels(annulus: Annulus, branch: Line, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
+    """Return the peeling branch from where it rises above ``floor`` to its highest point."""
+    heights = shape(annulus, branch.coordinate, branch.state).height
+    first = max(int(np.argmax(heights > floor)) - 1, 0)
+    last = min(int(np.argmax(heights)) + 1, heights.size - 1)
+    ends = float(branch.coordinate[first]), float(branch.coordinate[last])
+    return _panels(annulus, branch, ends, None, resolution, counter, DEEPEST)
+
+
+def pinned_panels(annulus: Annulus, peel: Panel, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
+    """Return the states at the widest contact from ``floor`` up to where it peels; none if it peels at once."""
+    width, top = float(peel.coordinate[0]), float(peel.height(peel.coordinate[0]))
+    if top - floor <= 1e-12 * (1 + abs(floor)):
+        return []
+    line = pinned_line(annulus, width, peel.state[:1], top, floor, counter)
+    if line.coordinate.size == 1:
+        return []
+    ends = float(line.coordinate[0]), float(line.coordinate[-1])
+    return _panels(annulus, line, ends, width, resolution, counter, DEEPEST // 2)
+
+
+def _panels(
+    annulus: Annulus,
+    line: Line,
+    ends: tuple[float, float],
+    width: float | None,
+    resolution: Resolution,
+    counter: Counter,
+    depth: int,
+) -> list[Panel]:
+    """Cover a line with panels whose series end."""
+    panel = None
+    for size in PANEL_SIZES:
+        finer = _panel(annulus, line, ends, width, resolution.order, size, counter)
+        if finer is None:
+            break
+        panel = finer
+        line = Line(panel.coordinate, panel.state)
+        if panel.tail < resolution.tail:
+            return [panel]
+    if depth == 0:
+        if panel is None:
+            raise NotConverged("membrane: the branch was found but its refinement did not converge")
+        return [panel]
+    middle = (ends[0] + ends[1]) / 2
+    return [
+        half
+        for part in ((ends[0], middle), (middle, ends[1]))
+        for half in _panels(annulus, line, part, width, resolution, counter, depth - 1)
+    ]
+
+
+def _panel(
+    annulus: Annulus,
+    line: Line,
+    ends: tuple[float, float],
+    width: float | None,
+    order: int,
+    size: int,
+    counter: Counter,
+) -> Panel | None:
+    """Solve states at Chebyshev points between the ends; ``None`` if one of them does not converge."""
+    low, high = ends
+    places = low + (high - low) * node_positions(size)
+    widths = places if width is None else np.full(places.size, width)
+    closure = Closure.RELEASE if width is None else Closure.HEIGHT
+    guess = resample(line.guess(places), order)
+    solved = counter.note(solve(annulus, widths, guess, closure=closure, target=places))
+    if not solved.converged.all():
+        return None
+    height = places if width is not None else shape(annulus, widths, solved.state).height
+    rise, pull, pressure = (_series(values, low, high) for values in (height, solved.state[:, -1], solved.state[:, -2]))
+    tail = max(_tail(rise), _tail(pull))
+    return Panel(places, widths, solved.state, rise, pull, pressure, tail, width is not None)
+
+
+def _series(values: Array, low: float, high: float) -> Chebyshev:
+    """Return the series through values at the Chebyshev points of [low, high]."""
+    size = values.size - 1
+    angles = np.pi * np.arange(size + 1) / size
+    weights = np.cos(np.outer(np.arange(size + 1), np.pi - angles)) * (2 / size)
+    weights[:, [0, -1]] /= 2
+    coefficients = weights @ values
+    coefficients[[0, -1]] /= 2
+    return Chebyshev(coefficients, domain=[low, high])
+
+
+def _tail(series: Chebyshev) -> float:
+    size = np.abs(series.coef)
+    return float(size[-3:].max() / max(size.max(), 1e-300))
+
+
+def roots(series: Chebyshev, low: float, high: float) -> list[float]:
+    """Return the real roots of a series in [low, high], rising."""
+    found = series.roots()
+    slack = 1e-9 * (high - low)
+    real = found.real[np.abs(found.imag) < 1e-7 * (series.domain[1] - series.domain[0])]
+    return sorted(float(np.clip(x, low, high)) for x in real if low - slack <= x <= high + slack)
+
+
+def path(peel: list[Panel], pinned: list[Panel], floor: float) -> list[Piece]:
+    """Return the stable stretches in the order in which a rising rim passes them."""
+    pieces = [Piece(panel, *map(float, panel.coordinate[[0, -1]])) for panel in pinned]
+    reached = float(peel[0].height(peel[0].coordinate[0])) if pinned else floor
+    rounding = 1e-11 * (1 + abs(reached))
+    for panel in peel:
+        low, high = map(float, panel.coordinate[[0, -1]])
+        for begin, end in pairwise([low, *roots(panel.height.deriv(), low, high), high]):
+            bottom, top = float(panel.height(begin)), float(panel.height(end))
+            if top <= max(bottom, reached):
+                continue
+            crossing = roots(panel.height - reached, begin, end) if bottom < reached - rounding else []
+            pieces.append(Piece(panel, crossing[0] if crossing else begin, end))
+            reached = top
+    return pieces
+
+
+def features(pieces: list[Piece]) -> Features:
+    """Read zero of force, onset of peeling, greatest pull, detachment and adhesion energy off a path."""
+    start = Place(pieces[0], pieces[0].begin)
+    zero = None if start.pull >= 0 else _first_zero(pieces)
+    peel = next((piece for piece in pieces if not piece.panel.pinned), pieces[-1])
+    candidates = [Place(piece, x) for piece in pieces for x in _pull_extremes(piece)]
+    peak = max(candidates, key=lambda place: place.pull)
+    begin = start if zero is None else zero
+    return Features(
+        zero=zero,
+        start=start,
+        onset=Place(peel, peel.begin),
+        peak=peak,
+        detachment=Place(pieces[-1], pieces[-1].end),
+        energy=_energy(pieces, begin),
+    )
+
+
+def _first_zero(pieces: list[Piece]) -> Place | None:
+    """Return where the pull turns positive: on a stretch, or at a jump."""
+    for piece in pieces:
+        if float(piece.panel.pull(piece.begin)) >= 0:
+            return Place(piece, piece.begin)
+        crossings = roots(piece.panel.pull, piece.begin, piece.end)
+        if crossings:
+            return Place(piece, crossings[0])
+    return None
+
+
+def _pull_extremes(piece: Piece) -> list[float]:
+    return [piece.begin, *roots(piece.panel.pull.deriv(), piece.begin, piece.end), piece.end]
+
+
+def _energy(pieces: list[Piece], begin: Place) -> float:
+    """Integrate the pull (over 2 pi) over the height from ``begin`` to detachment."""
+    total, running = 0.0, False
+    for piece in pieces:
+        running = running or piece is begin.piece
+        if running:
+            work = (piece.panel.pull * piece.panel.height.deriv()).integ()
+            total += float(work(piece.end) - work(begin.coordinate if piece is begin.piece else piece.begin))
+    return total
