@@ -32,8 +32,8 @@ class LivePrediction:
         Name of the model.
     retraction, force, force_low, force_high
         (m,), the curve against z_r (m) with its 90 % band, N, tared.
-    pressure
-        (m,), Pa gauge, or ``None`` where the scene has no pressure.
+    pressure, pressure_low, pressure_high
+        (m,), Pa gauge, with its 90 % band, or ``None`` where the scene has no pressure.
     pull_off_force, pull_off_distance
         F_p (N, a magnitude) and D_p (m).
     work_of_adhesion
@@ -62,6 +62,8 @@ class LivePrediction:
     force_low: Array
     force_high: Array
     pressure: Array | None
+    pressure_low: Array | None
+    pressure_high: Array | None
     pull_off_force: Estimate
     pull_off_distance: Estimate
     work_of_adhesion: Estimate

@@ -1,0 +1,67 @@
+"""What is asked of a scene before anything moves, said line by line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rig.bench import Bench, load_bench
+from rig.check import check
+from rig.errors import Refused, RigError
+from rig.library import find_scene
+from rig.scene import Scene, parse_scene
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A scene held against a bench: what was looked at, and why it was refused (empty when it was not)."""
+
+    scene: Scene | None
+    emulated: bool
+    findings: tuple[str, ...]
+    refusals: tuple[str, ...]
+
+    @property
+    def ready(self) -> bool:
+        """Whether the scene may be run."""
+        return self.scene is not None and not self.refusals
+
+
+def check_scene(name: str, bench_path: Path | None) -> Checked:
+    """Read scene and bench and hold one against the other. Opens and moves nothing."""
+    try:
+        scene = parse_scene(*find_scene(name))
+        bench, _ = load_bench(bench_path)
+    except RigError as error:
+        return Checked(None, bench_path is None, (), (str(error),))
+    try:
+        check(scene, bench)
+    except Refused as error:
+        return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), _reasons(error))
+    return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), ())
+
+
+def _reasons(error: Refused) -> tuple[str, ...]:
+    _, _, reasons = str(error).partition(": ")
+    return tuple((reasons or str(error)).split("; "))
+
+
+def _findings(scene: Scene, bench: Bench) -> list[str]:
+    protocol, limits = scene.protocol, bench.limits
+    found = [
+        f"load cell {bench.force.cell}: {bench.force.capacity_N:g} N; "
+        f"stops at {limits.compression_N:g} N compression, {limits.tension_N:g} N tension",
+        f"travel {bench.stage.minimum_mm:g} to {bench.stage.maximum_mm:g} mm, "
+        f"look-ahead {limits.look_ahead_um:g} \u00b5m",
+    ]
+    preload = getattr(protocol, "preload_N", None)
+    if preload is not None:
+        found.append(f"preload {preload:g} N of {min(limits.compression_N, bench.force.capacity_N):g} N")
+    pressure = getattr(protocol, "initial_pressure_kPa", None)
+    if pressure is not None and bench.pump is not None:
+        needed = scene.gripper.chamber_volume_ml * abs(pressure) / (scene.gas.atmospheric_pressure_kPa + pressure)
+        found.append(
+            f"P\u2080 {pressure:g} kPa within {limits.pressure_low_kPa:g} to {limits.pressure_high_kPa:g} kPa; "
+            f"syringe: {needed:.2f} of {bench.pump.syringe_volume_ml / 2:g} ml"
+        )
+    return found
