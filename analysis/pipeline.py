@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis import loading, preparation, retraction  # noqa: F401  (importing registers the steps)
+from analysis import chamber, indentation, loading, preparation, retraction  # noqa: F401  (importing registers the steps)
 from analysis.extraction import Extraction, extract, meanings, ordered, unit_of
 from analysis.numerics import Array
 from analysis.propagation import budget

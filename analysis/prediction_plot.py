@@ -48,7 +48,7 @@ def _draw_profile(prediction: Prediction, axes) -> None:  # type: ignore[no-unty
     )
     # The compressive start of a small sphere would dwarf the adhesion.
     axes.set_ylim(-1.25 * prediction.pull_off_force, 1.0 * prediction.pull_off_force)
-    axes.set_xlim(-0.5 * prediction.pull_off_distance, 1.08 * prediction.pull_off_distance)
+    axes.set_xlim(max(retraction[0], -0.5 * retraction[-1]), 1.08 * retraction[-1])
     right = axes.twinx()
     right.plot(retraction, prediction.pressure * 1e-3, color=PRESSURE, linestyle="--")
     right.set_ylabel("pressure $P_a$ (kPa, gauge)", color=PRESSURE)

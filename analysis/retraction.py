@@ -184,7 +184,7 @@ def pull_off(work: Extraction) -> Details:
 
 
 def _peak_shift(work: Extraction, fit: LocalFit) -> float:
-    """How far the peak moves, samples, when only the middle half of the window is fitted: what the cubic cannot follow."""
+    """How far the peak moves, samples, when only half the window is fitted: what the cubic cannot follow."""
     half = max(8, (fit.stop - fit.start) // 4)
     start, stop = max(fit.start, int(work.peak) - half), min(fit.stop, int(work.peak) + half + 1)
     narrow, _, _ = fit_window(work.force, start, stop, 3)

@@ -1,0 +1,157 @@
+"""Volume and tightness of the chamber: V_0 from Boyle's law, and the leak rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.errors import FeatureMissing
+from analysis.extraction import Details, Extraction, extraction_step
+from analysis.numerics import Array, block_means
+from model.parameters import STANDARD_ATMOSPHERE
+
+
+@dataclass(frozen=True)
+class BoyleFit:
+    """V_0 from pump volume against pressure.
+
+    Attributes
+    ----------
+    volume, uncertainty
+        V_0 and its standard uncertainty from the scatter, m^3.
+    offset
+        Pump volume at which P_a would be zero, m^3.
+    residual
+        (n,), m^3, of the fitted points.
+    """
+
+    volume: float
+    uncertainty: float
+    offset: float
+    residual: Array
+
+
+def fit_boyle(pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOSPHERE) -> BoyleFit:
+    """Fit V_0 to the volume the pump has put in and the pressure that followed, chamber closed and out of contact.
+
+    Isothermal: (P_atm + P_a) (V_0 - dV) = P_atm V_0 with dV the volume the plunger has moved in, so that
+    dV = V_0 P_a / (P_atm + P_a) + offset: a straight line whose slope is V_0.
+
+    Parameters
+    ----------
+    pumped
+        (n,), m^3, moved into the chamber.
+    pressure
+        (n,), Pa gauge.
+
+    Raises
+    ------
+    FeatureMissing
+        The pressure hardly changed.
+    """
+    share = pressure / (atmosphere + pressure)
+    if pumped.size < 8 or float(np.ptp(share)) < 1e-4:
+        raise FeatureMissing("the pressure changed by less than ten pascals; nothing to fit")
+    design = np.stack([share, np.ones_like(share)], axis=1)
+    solution, _, _, _ = np.linalg.lstsq(design, pumped, rcond=None)
+    residual = np.asarray(pumped - design @ solution, dtype=np.float64)
+    variance = float(residual @ residual) / (pumped.size - 2)
+    covariance = np.linalg.inv(design.T @ design) * variance
+    return BoyleFit(float(solution[0]), float(np.sqrt(covariance[0, 0])), float(solution[1]), residual)
+
+
+@extraction_step(
+    "volume",
+    title="Chamber volume",
+    protocols=("volume",),
+    gives={"chamber_volume_m3": "V_0 from pump volume against pressure (Boyle)"},
+    after=("segments",),
+)
+def volume(work: Extraction) -> Details:
+    """Fit the straight line dV = V_0 P_a / (P_atm + P_a) to 50 ms means of the whole record after the tare.
+
+    Temperature is taken as constant: the pump must move slowly, or wait.
+    """
+    run = work.run
+    if run.pump_volume is None or run.pressure is None:
+        raise FeatureMissing("the recording holds no pump volume or no pressure")
+    atmosphere = STANDARD_ATMOSPHERE if run.parameters is None else run.parameters.gas.atmospheric_pressure
+    length = max(1, round(0.05 * run.rate))
+    start = work.windows.free[1]
+    fit = fit_boyle(block_means(run.pump_volume[start:], length), block_means(run.pressure[start:], length), atmosphere)
+    work.set(chamber_volume_m3=fit.volume)
+    return {"decision": f"V_0 = {fit.volume * 1e6:.3f} mL", "fit": fit}
+
+
+@dataclass(frozen=True, slots=True)
+class Leak:
+    """Exponential decay of the pressure towards the room.
+
+    Attributes
+    ----------
+    time_constant
+        s; infinite for a tight chamber.
+    rate
+        Pa/s at the start: P_a / time constant.
+    flow
+        The same as a volume flow at room pressure, m^3/s, with V_0.
+    """
+
+    time_constant: float
+    rate: float
+    flow: float
+
+
+def fit_leak(time: Array, pressure: Array, volume: float, atmosphere: float = STANDARD_ATMOSPHERE) -> Leak:
+    """Fit P_a = P_1 exp(-t / tau): flow through a leak is proportional to the pressure difference.
+
+    Parameters
+    ----------
+    time, pressure
+        (n,), s and Pa gauge, chamber closed, pump at rest.
+    volume
+        V_0, m^3.
+    """
+    from scipy.optimize import least_squares
+
+    span = float(time[-1] - time[0])
+    level = float(pressure[: max(1, pressure.size // 20)].mean())
+    slope = float(np.polyfit(time - time[0], pressure, 1)[0])
+    scale = max(abs(level), 1.0)
+
+    def residual(unknown: Array) -> Array:
+        return (unknown[0] * np.exp(-unknown[1] * (time - time[0]) / span) - pressure / scale) * 1.0
+
+    guess = [level / scale, -slope * span / level if level else 0.0]
+    first, decay = least_squares(residual, guess).x
+    rate = float(first * scale * decay / span)
+    constant = float(span / decay) if decay else float("inf")
+    return Leak(constant, rate, rate * volume / atmosphere)
+
+
+@extraction_step(
+    "leak",
+    title="Leak",
+    protocols=("leak",),
+    gives={
+        "leak_rate_Pa_s": "fall of the pressure per second at the start of the hold, positive towards the room",
+        "leak_time_constant_s": "time in which the pressure falls to 1/e",
+        "leak_flow_m3_s": "the same as volume flow at room pressure",
+    },
+    after=("segments",),
+)
+def leak(work: Extraction) -> Details:
+    """Fit an exponential decay to the pressure of the ``hold`` (or ``dwell``) step, in 100 ms means."""
+    run = work.run
+    step = run.step("hold") or run.step("dwell")
+    if run.pressure is None or step is None:
+        raise FeatureMissing("the recording holds no pressure or no hold step")
+    if run.parameters is None:
+        raise FeatureMissing("without parameters the chamber volume is unknown")
+    length = max(1, round(0.1 * run.rate))
+    time, gas = (block_means(signal[step.start : step.stop], length) for signal in (run.time, run.pressure))
+    gas_parameters = run.parameters.gas
+    found = fit_leak(time, gas, run.parameters.gripper.chamber_volume, gas_parameters.atmospheric_pressure)
+    work.set(leak_rate_Pa_s=found.rate, leak_time_constant_s=found.time_constant, leak_flow_m3_s=found.flow)
+    return {"decision": f"tau = {found.time_constant:.3g} s", "leak": found}

@@ -1,0 +1,252 @@
+"""The JKR test (SI S4): work of adhesion from the pull-off force, contact area, and fits of JKR, DMT and Maugis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.errors import FeatureMissing
+from analysis.extraction import Details, Extraction, extraction_step
+from analysis.numerics import Array, block_means
+from analysis.quantities import validity
+from analysis.run import Run
+from model import jkr
+
+POINTS = 300
+"""The retraction curve is averaged into so many points before a fit."""
+
+
+def indenter_radius(run: Run) -> float:
+    """Return R, m, from the scene.
+
+    Raises
+    ------
+    FeatureMissing
+        The scene names none.
+    """
+    radius = run.settings.get("indenter_radius_mm")
+    if not isinstance(radius, int | float):
+        raise FeatureMissing("the scene names no indenter_radius_mm")
+    return float(radius) * 1e-3
+
+
+@extraction_step(
+    "work of adhesion",
+    title="Work of adhesion (S13)",
+    after=("pull-off",),
+    protocols=("indentation",),
+    gives={
+        "work_of_adhesion_J_m2": "w = 2 F_off / (3 pi R), SI Eq. S13",
+        "work_of_adhesion_thin_layer_J_m2": "the same force read for a thin incompressible bonded layer, F / (3 pi R)",
+    },
+)
+def work_of_adhesion(work: Extraction) -> Details:
+    """Apply S13, and check it: Tabor parameter, and contact radius against the film's thickness."""
+    radius = indenter_radius(work.run)
+    force = work.values["pull_off_force_N"]
+    bounds = jkr.thin_layer_bounds(force, radius)
+    work.set(
+        work_of_adhesion_J_m2=bounds.half_space,
+        work_of_adhesion_thin_layer_J_m2=bounds.incompressible_layer,
+    )
+    if work.run.parameters is None:
+        return {"decision": "S13; without the membrane's modulus and thickness its validity is unknown"}
+    membrane = work.run.parameters.membrane
+    modulus = jkr.contact_modulus(membrane.youngs_modulus)
+    area = _area(work.run)
+    contact = None if area is None else math.sqrt(area / math.pi)
+    found = validity(force, radius, modulus, membrane.thickness, contact)
+    decision = "S13 holds" if found.holds else "S13 with reserve: " + "; ".join(found.remarks)
+    return {"decision": decision, "validity": found}
+
+
+def _area(run: Run) -> float | None:
+    area = run.settings.get("contact_area_mm2")
+    return float(area) * 1e-6 if isinstance(area, int | float) else None
+
+
+@extraction_step(
+    "contact area",
+    title="Projected contact area",
+    after=("pull-off",),
+    protocols=("indentation", "fiber", "punch"),
+    gives={
+        "projected_area_m2": "contact area seen at pull-off",
+        "contact_stress_Pa": "F_off over the projected area",
+    },
+)
+def contact_area(work: Extraction) -> Details:
+    """Take the area measured on the still image (``contact_area_mm2`` of the scene) and divide the force by it."""
+    area = _area(work.run)
+    if area is None:
+        raise FeatureMissing("no contact_area_mm2: no still image was measured for this run")
+    work.set(projected_area_m2=area, contact_stress_Pa=work.values["pull_off_force_N"] / area)
+    return {"decision": f"A_pc = {area * 1e6:.3g} mm²"}
+
+
+@dataclass(frozen=True)
+class ContactFit:
+    """A contact model fitted to a retraction curve.
+
+    Attributes
+    ----------
+    model
+        ``"JKR"``, ``"DMT"`` or ``"Maugis"``.
+    work_of_adhesion, modulus
+        J/m^2 and contact modulus E*, Pa; with standard uncertainties from the fit's covariance.
+    origin
+        Separation at first touch, m.
+    strength
+        Cohesive strength of Maugis, Pa; ``nan`` for the others.
+    misfit
+        Root mean square residual, N.
+    separation, force
+        The fitted curve.
+    """
+
+    model: str
+    work_of_adhesion: float
+    work_of_adhesion_uncertainty: float
+    modulus: float
+    modulus_uncertainty: float
+    origin: float
+    strength: float
+    misfit: float
+    separation: Array
+    force: Array
+
+
+def fit_contact(
+    separation: Array, force: Array, radius: float, *, models: tuple[str, ...] = ("JKR", "DMT", "Maugis")
+) -> list[ContactFit]:
+    """Fit JKR, DMT and Maugis to the retraction curve of a JKR test.
+
+    Parameters
+    ----------
+    separation, force
+        (n,), m, rising, and N, compression positive: the attached part of the retraction.
+    radius
+        R of the indenter, m.
+
+    Returns
+    -------
+    list
+        One fit per model, best first. Free are w, E*, the origin and, for Maugis, the cohesive strength.
+
+    Raises
+    ------
+    FeatureMissing
+        The curve holds no tension or too few points.
+    """
+    length = max(1, separation.size // POINTS)
+    place, pull = block_means(separation, length), block_means(force, length)
+    if place.size < 12 or pull.min() >= 0:
+        raise FeatureMissing("the retraction holds no tension to fit")
+    return sorted((_fit(model, place, pull, radius) for model in models), key=lambda fit: fit.misfit)
+
+
+def _jkr(depth: Array, logs: Array, radius: float) -> Array:
+    work, modulus = (float(value) for value in np.exp(logs[:2]))
+    pull = math.pi * work / (2 * modulus)
+    root = (radius * math.sqrt(pull) / 2) ** (1 / 3)
+    fold = root**4 / radius - 2 * math.sqrt(pull) * root
+    return jkr.jkr_force(np.maximum(depth, fold * (1 - 1e-12)), work, radius, modulus)
+
+
+def _dmt(depth: Array, logs: Array, radius: float) -> Array:
+    work, modulus = np.exp(logs[:2])
+    contact = np.sqrt(np.maximum(depth, 0.0) * radius)
+    return np.asarray(4 * modulus * contact**3 / (3 * radius) - 2 * np.pi * radius * work, dtype=np.float64)
+
+
+def _maugis(depth: Array, logs: Array, radius: float) -> Array:
+    work, modulus, strength = (float(value) for value in np.exp(logs[:3]))
+    deepest = max(float(depth.max()), 1e-9)
+    contact = 1.5 * math.sqrt(deepest * radius) + 3.0 * (radius**2 * work / modulus) ** (1 / 3)
+    curve = jkr.maugis_curve(work, radius, modulus, strength, largest_contact=contact, points=400)
+    return np.asarray(np.interp(depth, curve.indentation[::-1], curve.force[::-1]), dtype=np.float64)
+
+
+LAWS: dict[str, Callable[[Array, Array, float], Array]] = {"JKR": _jkr, "DMT": _dmt, "Maugis": _maugis}
+"""Force at a depth for the logarithms of w, E* (and strength); beyond the last stable contact its force is kept."""
+
+
+def _fit(model: str, place: Array, pull: Array, radius: float) -> ContactFit:
+    work, modulus, origin = _first_guess(place, pull, radius)
+    jkr_start = np.array([math.log(work), math.log(modulus), origin / 1e-6])
+    first = _solve("JKR", place, pull, radius, jkr_start)
+    if model == "JKR":
+        return first
+    logs = [math.log(first.work_of_adhesion), math.log(first.modulus)]
+    if model == "DMT":
+        return _solve("DMT", place, pull, radius, np.array([*logs, first.origin / 1e-6]))
+    length = (math.pi * first.work_of_adhesion * (4 / 3 * first.modulus) ** 2 / radius) ** (1 / 3)
+    starts = (np.array([*logs, math.log(cohesion * length / 2), first.origin / 1e-6]) for cohesion in (0.3, 1.0, 4.0))
+    return min((_solve("Maugis", place, pull, radius, start) for start in starts), key=lambda fit: fit.misfit)
+
+
+def _solve(model: str, place: Array, pull: Array, radius: float, start: Array) -> ContactFit:
+    """Least squares over the logarithms of w, E* (and strength) and the origin in micrometres."""
+    from scipy.optimize import least_squares
+
+    law = LAWS[model]
+    scale = float(np.ptp(pull))
+
+    def residual(unknown: Array) -> Array:
+        return (law(unknown[-1] * 1e-6 - place, unknown[:-1], radius) - pull) / scale
+
+    solution = least_squares(residual, start, max_nfev=200, x_scale="jac")
+    jacobian = np.asarray(solution.jac, dtype=np.float64)
+    variance = float(np.sum(solution.fun**2)) / max(1, place.size - start.size)
+    spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
+    logs = solution.x
+    return ContactFit(
+        model=model,
+        work_of_adhesion=math.exp(logs[0]),
+        work_of_adhesion_uncertainty=math.exp(logs[0]) * float(spread[0]),
+        modulus=math.exp(logs[1]),
+        modulus_uncertainty=math.exp(logs[1]) * float(spread[1]),
+        origin=float(logs[-1]) * 1e-6,
+        strength=math.exp(logs[2]) if model == "Maugis" else math.nan,
+        misfit=float(np.sqrt(np.mean(solution.fun**2))) * scale,
+        separation=place,
+        force=np.asarray(residual(logs) * scale + pull, dtype=np.float64),
+    )
+
+
+def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float, float]:
+    """Work from S13; modulus from the slope of the curve over its span; origin a fifth of the span before the peak."""
+    force = -float(pull.min())
+    span = max(float(np.ptp(place)), 1e-9)
+    modulus = float(np.ptp(pull)) / span / (2 * math.sqrt(radius * span))
+    return jkr.work_of_adhesion_jkr(force, radius), modulus, float(place[int(np.argmin(pull))]) - 0.2 * span
+
+
+@extraction_step(
+    "contact models",
+    title="JKR, DMT and Maugis beside S13",
+    after=("work of adhesion", "detachment"),
+    protocols=("indentation",),
+    gives={
+        "fitted_work_of_adhesion_J_m2": "work of adhesion of the contact model that fits the retraction best",
+        "fitted_modulus_Pa": "contact modulus E* of that model",
+    },
+)
+def contact_models(work: Extraction) -> Details:
+    """Fit JKR and DMT to the attached part of the retraction, F against z, and keep the better.
+
+    Maugis has one parameter more and is fitted on request only (``fit_contact``): it follows noise where the others
+    suffice.
+    """
+    start, _ = work.retraction()
+    part = slice(start, int(work.release))
+    radius = indenter_radius(work.run)
+    fits = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
+    work.set(fitted_work_of_adhesion_J_m2=fits[0].work_of_adhesion, fitted_modulus_Pa=fits[0].modulus)
+    words = "; ".join(
+        f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in fits
+    )
+    return {"decision": words, "fits": fits}

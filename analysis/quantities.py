@@ -1,0 +1,119 @@
+"""The papers' derived quantities with uncertainties: ratio, stress, efficiency, work of adhesion and its validity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from analysis.quantity import Quantity
+from model import jkr
+
+EQUILIBRIUM_SEPARATION = 0.3e-9
+"""z_0 of the Tabor parameter for van der Waals contacts, m."""
+
+LARGEST_RATIO_FOR_HALF_SPACE = 0.1
+"""Contact radius over film thickness up to which a film on glass counts as a half-space."""
+
+
+def quotient(numerator: Quantity, denominator: Quantity, unit: str, explanation: str) -> Quantity:
+    """Return numerator / denominator; their uncertainties are taken as independent."""
+    value = numerator.value / denominator.value
+    parts = {
+        "numerator": abs(numerator.uncertainty / denominator.value),
+        "denominator": abs(value * denominator.uncertainty / denominator.value),
+    }
+    return Quantity(value, math.hypot(*parts.values()), unit, explanation, parts)
+
+
+def enhancement_ratio(largest: Quantity, least: Quantity) -> Quantity:
+    """Return F_off|Max / F_off|Min (Table S1). The common error of the load cell's gain cancels and is left out."""
+    return quotient(_without_gain(largest), _without_gain(least), "", "largest over least pull-off force")
+
+
+def _without_gain(force: Quantity) -> Quantity:
+    parts = {source: part for source, part in force.budget.items() if source != "force calibration"}
+    total = math.sqrt(sum(part**2 for part in parts.values())) if parts else force.uncertainty
+    return Quantity(force.value, total, force.unit, force.explanation, parts)
+
+
+def full_contact_area(radius: float, uncertainty: float = 0.0) -> Quantity:
+    """Return A_c = pi r_e^2 (m in, m^2 out)."""
+    return Quantity(math.pi * radius**2, 2 * math.pi * radius * uncertainty, "m^2", "π r_e²")
+
+
+def adhesion_stress(force: Quantity, area: Quantity) -> Quantity:
+    """Return sigma_ad = F_off / A_c, Pa."""
+    return quotient(force, area, "Pa", "pull-off force over contact area")
+
+
+def adhesion_efficiency(stress: Quantity, reference: Quantity) -> Quantity:
+    """Return eps_ad = (F_off / A_c) / sigma_ad, sigma_ad from the JKR test of the same membrane."""
+    return quotient(stress, reference, "", "adhesion stress over that of the JKR test")
+
+
+@dataclass(frozen=True)
+class Validity:
+    """Whether S13 may be read as a work of adhesion.
+
+    Attributes
+    ----------
+    tabor
+        Tabor parameter: JKR above 5, DMT below 0.1.
+    confinement
+        Contact radius over film thickness: a half-space below about 0.1.
+    bounds
+        Works of adhesion that the same force means for other supports, J/m^2.
+    remarks
+        What speaks against S13, in words; empty where nothing does.
+    """
+
+    tabor: float
+    confinement: float
+    bounds: jkr.WorkOfAdhesionBounds
+    remarks: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing speaks against S13."""
+        return not self.remarks
+
+
+def work_of_adhesion(force: Quantity, radius: Quantity) -> Quantity:
+    """Return w = 2 F_off / (3 pi R), J/m^2 (SI Eq. S13)."""
+    value = jkr.work_of_adhesion_jkr(force.value, radius.value)
+    parts = {
+        "force": value * force.uncertainty / abs(force.value),
+        "radius": value * radius.uncertainty / radius.value,
+    }
+    return Quantity(value, math.hypot(*parts.values()), "J/m^2", "2 F_off / (3 π R), SI Eq. S13", parts)
+
+
+def validity(force: float, radius: float, modulus: float, thickness: float, contact_radius: float | None) -> Validity:
+    """Check the assumptions behind S13.
+
+    Parameters
+    ----------
+    force, radius
+        F_off (N) and R (m).
+    modulus
+        Contact modulus E*, Pa.
+    thickness
+        Of the film on its rigid support, m.
+    contact_radius
+        At pull-off, m; ``None``: the one JKR gives.
+    """
+    work = jkr.work_of_adhesion_jkr(force, radius)
+    tabor = jkr.tabor_parameter(work, radius, modulus, EQUILIBRIUM_SEPARATION)
+    contact = (3 * force * radius / (4 * modulus)) ** (1 / 3) if contact_radius is None else contact_radius
+    confinement = contact / thickness
+    remarks = []
+    if tabor < 5:
+        regime = "DMT" if tabor < 0.1 else "the transition between DMT and JKR"
+        remarks.append(f"Tabor parameter {tabor:.2g}: {regime}, not JKR")
+    bounds = jkr.thin_layer_bounds(force, radius)
+    if confinement > LARGEST_RATIO_FOR_HALF_SPACE:
+        remarks.append(
+            f"contact radius {confinement:.2g} times the film's thickness: no half-space; "
+            f"thin-layer limits give {bounds.incompressible_layer:.2g} to {bounds.half_space:.2g} J/m²"
+        )
+    return Validity(tabor, confinement, bounds, tuple(remarks))

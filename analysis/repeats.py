@@ -1,0 +1,261 @@
+"""Repeats of one condition: bands on a common z_r grid, outliers by a stated rule, pooled numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.numerics import Array
+from analysis.pipeline import Analysis
+from analysis.quantity import Quantity
+from analysis.run import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+OUTLIER_RULE = (
+    "Grubbs' test at 1 % on F_p and on D_p of the repeats of one condition, at least four repeats, one outlier at a "
+    "time; a value within three standard uncertainties of the mean is never one. Outliers are left out of means and "
+    "bands, and listed."
+)
+
+RANDOM_SOURCES = frozenset({"noise", "sampling", "drift", "contact point"})
+"""Sources that differ from repeat to repeat; the others (calibration) are common to all."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Condition:
+    """What repeats have in common.
+
+    Attributes
+    ----------
+    protocol, gripper
+        As in the scene.
+    diameter
+        d_b, m; 0 stands for an unbounded flat.
+    flat
+        Whether the substrate is flat.
+    pressure
+        Nominal P_0, Pa gauge, or ``None`` vented.
+    place
+        Position on the membrane (indentation) or name of the sample; empty where there is none.
+    """
+
+    protocol: str
+    gripper: str = "rigid"
+    flat: bool = False
+    diameter: float = 0.0
+    pressure: float | None = None
+    place: str = ""
+
+    @classmethod
+    def of(cls, run: Run) -> Condition:
+        """Read the condition from the run's scene."""
+        gripper = str(run.settings.get("gripper", "rigid"))
+        place = str(run.settings.get("position", run.settings.get("sample", "")))
+        if run.parameters is None:
+            return cls(run.protocol, gripper, place=place)
+        substrate = run.parameters.substrate
+        pressure = None if run.pressure is None else run.parameters.gas.initial_pressure
+        return cls(run.protocol, gripper, substrate.shape == "flat", substrate.diameter or 0.0, pressure, place)
+
+    @property
+    def substrate(self) -> str:
+        """Name of the substrate as in the papers' tables."""
+        if self.flat:
+            return f"flat disk {self.diameter * 1e3:g} mm" if self.diameter else "Flat Glass"
+        return f"d_b {self.diameter * 1e3:g} mm"
+
+    def __str__(self) -> str:
+        pressure = "vented" if self.pressure is None else f"P_0 = {self.pressure / 1e3:+.1f} kPa"
+        parts = [self.substrate, pressure] if self.protocol == "pull_off" else [self.protocol, self.place]
+        if self.gripper != "rigid":
+            parts.insert(0, f"{self.gripper} gripper")
+        return ", ".join(part for part in parts if part)
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """One number over the repeats.
+
+    Attributes
+    ----------
+    mean, deviation
+        Mean and standard deviation (n - 1) of the repeats.
+    count
+        How many.
+    uncertainty
+        Standard uncertainty of the mean: deviation / sqrt(n), and the sources common to all repeats.
+    """
+
+    mean: float
+    deviation: float
+    count: int
+    uncertainty: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Group:
+    """The repeats of one condition; ``outliers`` names those left out and why."""
+
+    condition: Condition
+    members: tuple[Analysis, ...]
+    outliers: Mapping[str, str] = field(default_factory=dict)
+    rule: str = OUTLIER_RULE
+
+    @property
+    def kept(self) -> tuple[Analysis, ...]:
+        """The repeats that count."""
+        return tuple(member for member in self.members if member.run.name not in self.outliers)
+
+    def pooled(self, feature: str) -> Pooled | None:
+        """Return a feature over the repeats, or ``None`` where no repeat has it."""
+        found = [member.features[feature] for member in self.kept if feature in member.features]
+        return pool(found) if found else None
+
+    def features(self) -> list[str]:
+        """Return the names of all features that any repeat has, in order."""
+        return list(dict.fromkeys(name for member in self.kept for name in member.features))
+
+
+def pool(quantities: Sequence[Quantity]) -> Pooled:
+    """Pool one quantity over repeats."""
+    values = np.array([quantity.value for quantity in quantities])
+    common = np.array([_common(quantity) for quantity in quantities])
+    deviation = float(values.std(ddof=1)) if values.size > 1 else float("nan")
+    random = deviation / np.sqrt(values.size) if values.size > 1 else quantities[0].uncertainty
+    total = random if values.size == 1 else float(np.hypot(random, float(common.mean())))
+    return Pooled(float(values.mean()), deviation, values.size, float(total), quantities[0].unit)
+
+
+def _common(quantity: Quantity) -> float:
+    return float(np.sqrt(sum(part**2 for source, part in quantity.budget.items() if source not in RANDOM_SOURCES)))
+
+
+def group(analyses: Iterable[Analysis]) -> list[Group]:
+    """Put analyses of equal condition together, in the order of substrate and pressure, and look for outliers."""
+    members: dict[Condition, list[Analysis]] = {}
+    for analysis in analyses:
+        members.setdefault(Condition.of(analysis.run), []).append(analysis)
+    order = sorted(members, key=_order)
+    return [Group(condition, tuple(members[condition]), _outliers(members[condition])) for condition in order]
+
+
+def _order(condition: Condition) -> tuple[str, str, bool, float, float, str]:
+    pressure = np.inf if condition.pressure is None else -condition.pressure
+    return (condition.protocol, condition.gripper, condition.flat, condition.diameter, pressure, condition.place)
+
+
+def _outliers(members: Sequence[Analysis]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for feature, symbol in (("pull_off_force_N", "F_p"), ("pull_off_distance_m", "D_p")):
+        named = [(m.run.name, m.features[feature]) for m in members if feature in m.features]
+        for name, words in _grubbs(named).items():
+            found.setdefault(name, f"{symbol} {words}")
+    return found
+
+
+def _grubbs(named: Sequence[tuple[str, Quantity]]) -> dict[str, str]:
+    """Return the outliers of one quantity, by name, with what gave them away."""
+    from scipy.stats import t
+
+    left = list(named)
+    found: dict[str, str] = {}
+    while len(left) >= 4:
+        values = np.array([quantity.value for _, quantity in left])
+        deviation, n = float(values.std(ddof=1)), len(left)
+        far = int(np.argmax(np.abs(values - values.mean())))
+        distance = abs(float(values[far] - values.mean()))
+        quantile = float(t.ppf(1 - 0.01 / (2 * n), n - 2))
+        critical = (n - 1) / np.sqrt(n) * np.sqrt(quantile**2 / (n - 2 + quantile**2))
+        if distance <= critical * deviation or distance <= 3 * left[far][1].uncertainty:
+            break
+        name, quantity = left.pop(far)
+        found[name] = (
+            f"= {quantity}, {distance / deviation:.2f} standard deviations from the mean (limit {critical:.2f})"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Band:
+    """Mean and standard deviation of the curves of a group on one grid of z_r: the shaded areas of the papers.
+
+    All arrays have the length of ``retraction``; pressures are ``None`` where a repeat has none.
+    """
+
+    retraction: Array
+    force: Array
+    force_deviation: Array
+    pressure: Array | None
+    pressure_deviation: Array | None
+    count: int
+
+    def frame(self) -> pd.DataFrame:
+        """Return the band as a DataFrame with units in the column names."""
+        import pandas as pd
+
+        columns = {
+            "retraction_m": self.retraction,
+            "force_N": self.force,
+            "force_standard_deviation_N": self.force_deviation,
+        }
+        if self.pressure is not None and self.pressure_deviation is not None:
+            columns |= {"pressure_Pa": self.pressure, "pressure_standard_deviation_Pa": self.pressure_deviation}
+        return pd.DataFrame(columns)
+
+
+def band(members: Group, points: int = 400) -> Band | None:
+    """Average the curves of a group on ``points`` values of z_r common to all; ``None`` where none has a curve.
+
+    The grid runs from where the last of the curves begins to where the first ends. Each curve is averaged within the
+    cells of the grid first, so that noise does not enter the deviation.
+    """
+    curves = [member.curve for member in members.kept if member.curve is not None]
+    if not curves:
+        return None
+    start = max(float(curve.retraction[:16].mean()) for curve in curves)
+    stop = min(float(curve.retraction.max()) for curve in curves)
+    if stop <= start:
+        return None
+    grid = np.linspace(start, stop, points)
+    forces = np.array([on_grid(curve.retraction, curve.force, grid) for curve in curves])
+    force, deviation = _mean_and_deviation(forces)
+    if any(curve.pressure is None for curve in curves):
+        return Band(grid, force, deviation, None, None, len(curves))
+    gas = np.array([on_grid(c.retraction, c.pressure, grid) for c in curves if c.pressure is not None])
+    return Band(grid, force, deviation, *_mean_and_deviation(gas), len(curves))
+
+
+def _mean_and_deviation(rows: Array) -> tuple[Array, Array]:
+    deviation = rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(rows.shape[1])
+    return rows.mean(axis=0), np.asarray(deviation, dtype=np.float64)
+
+
+def on_grid(place: Array, value: Array, grid: Array) -> Array:
+    """Average ``value`` in cells centred on an even ``grid``; empty cells are interpolated."""
+    step = float(grid[1] - grid[0])
+    cell = np.floor((place - grid[0]) / step + 0.5).astype(np.int64)
+    inside = (cell >= 0) & (cell < grid.size)
+    count = np.bincount(cell[inside], minlength=grid.size)
+    total = np.bincount(cell[inside], weights=value[inside], minlength=grid.size)
+    filled = count > 0
+    return np.asarray(np.interp(grid, grid[filled], total[filled] / count[filled]), dtype=np.float64)
+
+
+def pooled_frame(groups: Iterable[Group]) -> pd.DataFrame:
+    """Return one row per condition and feature: mean, standard deviation, count, uncertainty of the mean, unit."""
+    import pandas as pd
+
+    rows = [
+        (str(members.condition), name, pooled.mean, pooled.deviation, pooled.count, pooled.uncertainty, pooled.unit)
+        for members in groups
+        for name in members.features()
+        if (pooled := members.pooled(name)) is not None
+    ]
+    columns = ["condition", "feature", "mean", "standard_deviation", "count", "uncertainty_of_mean", "unit"]
+    return pd.DataFrame(rows, columns=columns)
