@@ -20,8 +20,8 @@ from rig.live import LivePrediction
 
 Array = NDArray[np.float64]
 
-BLOCKS = 900
-"""Blocks per plot: about what a screen has pixels for."""
+BLOCKS = 250
+"""Least number of blocks in a plot; up to four times as many are drawn, about one to a pixel."""
 WINDOW_S = 20.0
 _EMPTY: Array = np.empty(0)
 
@@ -56,7 +56,7 @@ class Plot:
         self.item.hideButtons()
         self.item.setMenuEnabled(False)
         self.item.disableAutoRange()
-        self.item.showGrid(x=True, y=True, alpha=0.18)
+        self.item.showGrid(x=True, y=True, alpha=0.25)
         self.following = True
         self.item.getViewBox().sigRangeChangedManually.connect(self._unfollow)
         self.item.getViewBox().sigXRangeChanged.connect(lambda *_: self._zoomed())
@@ -108,6 +108,7 @@ class Plot:
             axis.setTextPen(theme.text)
             axis.setTickFont(font)
             axis.enableAutoSIPrefix(False)
+            axis.setStyle(maxTickLevel=0)
             axis.setLabel(f"{quantity.symbol} ({quantity.unit})", **{"font-size": "16px", "color": theme.text})
         self.item.getAxis("left").setWidth(72)
         self.measured.setPen(pg.mkPen(theme.measured, width=2))
