@@ -1,4 +1,4 @@
-"""Fits behind the calibration records: load cell against dead weights, compliance against a rigid stop, pressure zero."""
+"""Fits behind the calibration records: dead weights on the load cell, a rigid stop for compliance, pressure zero."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def fit_boyle(pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOS
     after=("segments",),
 )
 def volume(work: Extraction) -> Details:
-    """Fit the straight line dV = V_0 P_a / (P_atm + P_a) to 50 ms means of the whole record after the tare.
+    """Fit the straight line dV = V_0 P_a / (P_atm + P_a) to 50 ms means of the whole record.
 
     Temperature is taken as constant: the pump must move slowly, or wait.
     """
@@ -78,8 +78,7 @@ def volume(work: Extraction) -> Details:
         raise FeatureMissing("the recording holds no pump volume or no pressure")
     atmosphere = STANDARD_ATMOSPHERE if run.parameters is None else run.parameters.gas.atmospheric_pressure
     length = max(1, round(0.05 * run.rate))
-    start = work.windows.free[1]
-    fit = fit_boyle(block_means(run.pump_volume[start:], length), block_means(run.pressure[start:], length), atmosphere)
+    fit = fit_boyle(block_means(run.pump_volume, length), block_means(run.pressure, length), atmosphere)
     work.set(chamber_volume_m3=fit.volume)
     return {"decision": f"V_0 = {fit.volume * 1e6:.3f} mL", "fit": fit}
 
@@ -121,7 +120,8 @@ def fit_leak(time: Array, pressure: Array, volume: float, atmosphere: float = ST
     scale = max(abs(level), 1.0)
 
     def residual(unknown: Array) -> Array:
-        return (unknown[0] * np.exp(-unknown[1] * (time - time[0]) / span) - pressure / scale) * 1.0
+        decayed = unknown[0] * np.exp(-unknown[1] * (time - time[0]) / span)
+        return np.asarray(decayed - pressure / scale, dtype=np.float64)
 
     guess = [level / scale, -slope * span / level if level else 0.0]
     first, decay = least_squares(residual, guess).x

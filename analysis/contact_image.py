@@ -1,4 +1,4 @@
-"""Contact area and peel-zone width from a still image: threshold, largest region, calibrated scale (SI S4; EML Fig. 3f)."""
+"""Contact area and peel-zone width from a still image: threshold, largest region, scale (SI S4; EML Fig. 3f)."""
 
 from __future__ import annotations
 

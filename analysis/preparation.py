@@ -12,6 +12,9 @@ from analysis.run import Run
 SMOOTHING = 0.02
 """Width of the running mean used to find places (never values), s."""
 
+WITHOUT_CONTACT = frozenset({"volume", "leak"})
+"""Protocols that never touch a sample: any of their samples shows the zero of force."""
+
 NOISE_MEMORY = 0.1
 """Block length on which the colour of the noise is measured, s."""
 
@@ -38,6 +41,8 @@ def segments(work: Extraction) -> Details:
         free = (tare.start, tare.stop)
     elif approach is not None:
         free = (approach[0], approach[0] + max(16, (approach[1] - approach[0]) // 20))
+    elif run.protocol in WITHOUT_CONTACT:
+        free = (0, min(run.force.size, max(16, round(run.rate))))
     else:
         raise AnalysisError(f"{run.name}: neither a tare nor an approach step; the zero of force is unknown")
     if free[1] - free[0] < 16:

@@ -64,6 +64,9 @@ def _systematic(work: Extraction) -> Iterator[tuple[str, Run]]:
             ("pressure calibration", sensors.pressure_gain, lambda u: replace(run, pressure=pressure * (1 + u))),
             ("pressure zero", sensors.pressure_offset, lambda u: replace(run, pressure=pressure + u)),
         ]
+    pumped = run.pump_volume
+    if pumped is not None:
+        changes.append(("pump volume", sensors.pump_volume, lambda u: replace(run, pump_volume=pumped * (1 + u))))
     for source, uncertainty, change in changes:
         if uncertainty > 0:
             yield source, change(uncertainty)

@@ -35,6 +35,8 @@ class Sensors:
         Standard uncertainty in N and Pa.
     position
         Standard uncertainty of the stage's position scale, relative.
+    pump_volume
+        Standard uncertainty of the volume the pump displaces (syringe diameter), relative.
     compliance, compliance_uncertainty
         C of load cell, fixture and frame, m/N. A compressed load train lets the gripper stay behind the stage:
         true separation = height + F C (height rises away from the sample, F is positive in compression).
@@ -47,6 +49,7 @@ class Sensors:
     position: float = 0.0
     compliance: float = 0.0
     compliance_uncertainty: float = 0.0
+    pump_volume: float = 0.0
 
 
 @dataclass(frozen=True)
