@@ -9,13 +9,26 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Protocol, Self
+
+from drivers.emulated.faults import Fault, Faults
 
 Write = Callable[[bytes], None]
 """Puts bytes on the wire now; raises ``OSError`` if nobody is there."""
 
 LEAVING_PATIENCE = 0.25
+
+WIRE_FAULTS: Mapping[str, str] = MappingProxyType(
+    {
+        "silent": "no reply reaches the host; commands are still obeyed",
+        "slow": "every reply comes so many seconds late (default 1)",
+        "unplugged": "the connection breaks and no other is accepted",
+        "garbage": "replies are mixed with random bytes",
+        "late": "every reply comes only when the next question is asked",
+    }
+)
 
 
 class Unplugged(Exception):
@@ -91,6 +104,81 @@ class Line:
             # A host that has left misses its reply; the instrument does not care.
             with contextlib.suppress(OSError):
                 self._put(data)
+
+
+class FaultyWire:
+    """What the fault script does to an instrument's wire, and which faults have just begun.
+
+    Parameters
+    ----------
+    faults
+        The script.
+    device
+        The instrument's name in it.
+    latency
+        Delay of every reply, s of real time.
+    seed
+        Chooses the random bytes.
+    """
+
+    def __init__(self, faults: Faults, device: str, latency: float, seed: int) -> None:
+        self._faults = faults
+        self._device = device
+        self._latency = latency
+        self._seed = seed
+        self._held = b""
+        self._spoiled = 0
+        self._begun: set[str] = set()
+
+    def fault(self, kind: str) -> Fault | None:
+        """Return the active fault of this kind."""
+        return self._faults.active(self._device, kind)
+
+    def fault_begins(self, kind: str) -> Fault | None:
+        """Return the fault of this kind when it has just become active."""
+        fault = self.fault(kind)
+        if fault is None:
+            self._begun.discard(kind)
+            return None
+        if kind in self._begun:
+            return None
+        self._begun.add(kind)
+        return fault
+
+    def check_plugged(self) -> None:
+        """Raise ``Unplugged`` while the cable is out."""
+        if self.fault("unplugged"):
+            raise Unplugged
+
+    def deliver(self, data: bytes, line: Line) -> None:
+        """Put a reply on the line as the present faults let it through. Not to be called under the plant's lock."""
+        if self.fault("silent"):
+            return
+        if self.fault("garbage"):
+            data = self._spoil(data)
+        if self.fault("late"):
+            self._held, data = data, self._held
+        elif self._held:
+            self._held, data = b"", self._held + data
+        slow = self.fault("slow")
+        if data:
+            line.send(data, self._latency + ((slow.value or 1.0) if slow else 0.0))
+
+    def _spoil(self, data: bytes) -> bytes:
+        """Mix a reply with noise, differently every time and the same in every run."""
+        self._spoiled += 1
+        noise = scrambled(self._spoiled, self._seed).to_bytes(8, "little")
+        mixtures = (b"\n" + noise + b"\n", noise + data, data[: len(data) // 2] + noise, noise + b"\n" + data)
+        return mixtures[self._spoiled % len(mixtures)]
+
+
+def scrambled(number: int, seed: int) -> int:
+    """Return 64 bits that look random and depend on nothing but the arguments (splitmix64)."""
+    mask = (1 << 64) - 1
+    bits = (number + 0x9E3779B97F4A7C15 * (seed + 1)) & mask
+    bits = ((bits ^ (bits >> 30)) * 0xBF58476D1CE4E5B9) & mask
+    bits = ((bits ^ (bits >> 27)) * 0x94D049BB133111EB) & mask
+    return bits ^ (bits >> 31)
 
 
 def _nowhere(data: bytes) -> None:

@@ -13,17 +13,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from drivers.emulated.faults import Fault
-from drivers.emulated.server import Line, Unplugged
+from drivers.emulated.server import WIRE_FAULTS, FaultyWire, Line, scrambled
 from drivers.emulated.world import World
 
 FAULTS: Mapping[str, str] = MappingProxyType(
     {
-        "silent": "no reply reaches the host; commands are still obeyed",
-        "slow": "every reply comes so many seconds late (default 1)",
-        "unplugged": "the connection breaks and no other is accepted",
-        "garbage": "replies are mixed with random bytes",
-        "late": "every reply comes only when the next question is asked",
+        **WIRE_FAULTS,
         "error_code": "the controller latches this error and refuses set commands with it (default 2)",
         "blocked": "the carriage is held: motion error -1024, servo off",
         "limit_switch": "a limit switch closes (value < 0 negative, > 0 positive, 0 the one ahead); motion stops",
@@ -155,7 +150,7 @@ class EmulatedController:
         self._travel = travel
         self._switches = (travel[0] - switch_margin, travel[1] + switch_margin)
         self._step = encoder_step
-        self._latency = latency
+        self._wire = FaultyWire(world.faults, "stage", latency, seed)
         self._error_latch = error_latch
         self._limits_idle = 0b101 if limit_bits_inverted else 0
         self._leading_nul = leading_nul
@@ -186,10 +181,7 @@ class EmulatedController:
         }
         self._stored = dict(self._parameters)
         self._commands = self._command_table()
-        self._begun: set[str] = set()
         self._deaf_until = -math.inf
-        self._held: bytes = b""
-        self._garbage = 0
         with world.lock:
             self._power_up()
             if referenced:
@@ -198,9 +190,8 @@ class EmulatedController:
 
     def connect(self, line: Line) -> ControllerSession:
         """Begin a session with a host."""
-        if self._fault("unplugged"):
-            raise Unplugged
-        return ControllerSession(self, line)
+        self._wire.check_plugged()
+        return ControllerSession(self, line, self._wire)
 
     # ------------------------------------------------------------------ what arrives
 
@@ -231,27 +222,6 @@ class EmulatedController:
                 return None
             return reply if addressed is None else f"0 {addressed} {reply}"
 
-    def deliver(self, reply: str, line: Line) -> None:
-        """Put a reply on the wire, as the present faults let it through. Call it without holding the plant's lock."""
-        data = reply.encode("latin-1") + b"\n"
-        if self._fault("silent"):
-            return
-        if self._fault("garbage"):
-            data = self._spoiled(data)
-        if self._fault("late"):
-            self._held, data = data, self._held
-        elif self._held:
-            self._held, data = b"", self._held + data
-        slow = self._fault("slow")
-        delay = self._latency + ((slow.value or 1.0) if slow else 0.0)
-        if data:
-            line.send(data, delay)
-
-    def check_plugged(self) -> None:
-        """Raise ``Unplugged`` while the cable is out."""
-        if self._fault("unplugged"):
-            raise Unplugged
-
     def _strip_address(self, words: list[str]) -> tuple[int | None, list[str]]:
         """Split ``addr [0] COMMAND ...``; lines for another controller are dropped."""
         if not words or not words[0].isdecimal():
@@ -268,23 +238,12 @@ class EmulatedController:
         try:
             if handler is None or name.startswith("#"):
                 raise Refused(UNKNOWN_COMMAND)
-            if is_set_command and (fault := self._fault("error_code")):
+            if is_set_command and (fault := self._wire.fault("error_code")):
                 raise Refused(int(fault.value) or UNKNOWN_COMMAND)
             return handler(words[1:])
         except Refused as refusal:
             self._latch(refusal.code)
             return None
-
-    def _spoiled(self, data: bytes) -> bytes:
-        """Mix a reply with noise, differently every time and the same in every run."""
-        self._garbage += 1
-        noise = scrambled(self._garbage, self._seed).to_bytes(8, "little")
-        kind = self._garbage % 4
-        if kind == 0:
-            return b"\n" + noise + b"\n"
-        if kind == 1:
-            return noise + data
-        return data[: len(data) // 2] + noise if kind == 2 else noise + b"\n" + data
 
     # ------------------------------------------------------------------ state
 
@@ -301,20 +260,6 @@ class EmulatedController:
         self._world.axis.halt(math.inf)
         self._offset = self._world.axis.position
 
-    def _fault(self, kind: str) -> Fault | None:
-        return self._world.faults.active("stage", kind)
-
-    def _fault_begins(self, kind: str) -> Fault | None:
-        """Return the fault of this kind when it has just become active."""
-        fault = self._fault(kind)
-        if fault is None:
-            self._begun.discard(kind)
-            return None
-        if kind in self._begun:
-            return None
-        self._begun.add(kind)
-        return fault
-
     @property
     def _is_deaf(self) -> bool:
         return time.monotonic() < self._deaf_until
@@ -326,12 +271,12 @@ class EmulatedController:
     def _catch_up(self) -> None:
         """Let happen what has happened since the last command: faults, trips, the end of a reference move."""
         axis = self._world.axis
-        if fault := self._fault_begins("rebooted"):
+        if fault := self._wire.fault_begins("rebooted"):
             self._power_up()
             self._deaf_until = time.monotonic() + fault.value
-        if fault := self._fault_begins("error_code"):
+        if fault := self._wire.fault_begins("error_code"):
             self._latch(int(fault.value) or UNKNOWN_COMMAND)
-        if self._fault("servo_lost"):
+        if self._wire.fault("servo_lost"):
             self._drop_servo()
         following_error = abs(axis.commanded - axis.position) * 1e3
         if self._servo and (self._held_fast or following_error > self._number(0x8)):
@@ -345,7 +290,7 @@ class EmulatedController:
 
     @property
     def _held_fast(self) -> bool:
-        return self._world.axis.moving and self._fault("blocked") is not None
+        return self._world.axis.moving and self._wire.fault("blocked") is not None
 
     def _drop_servo(self) -> None:
         if self._servo:
@@ -357,7 +302,7 @@ class EmulatedController:
         axis = self._world.axis
         position, velocity = axis.position, axis.velocity
         pressed = (0b001 if position <= self._switches[0] else 0) | (0b100 if position >= self._switches[1] else 0)
-        if fault := self._fault("limit_switch"):
+        if fault := self._wire.fault("limit_switch"):
             pressed |= self._pressed or (0b100 if (fault.value or velocity) > 0 else 0b001)
         newly, self._pressed = pressed & ~self._pressed, pressed
         heads_in = (pressed & 0b001 and velocity < 0) or (pressed & 0b100 and velocity > 0)
@@ -526,7 +471,7 @@ class EmulatedController:
         on = self._switch(words)
         if not on:
             self._drop_servo()
-        elif not self._servo and not self._fault("servo_lost"):
+        elif not self._servo and not self._wire.fault("servo_lost"):
             self._world.axis.halt(math.inf)
             self._servo = True
 
@@ -666,14 +611,15 @@ class ControllerSession:
 
     watch_interval: float | None = None
 
-    def __init__(self, controller: EmulatedController, line: Line) -> None:
+    def __init__(self, controller: EmulatedController, line: Line, wire: FaultyWire) -> None:
         self._controller = controller
         self._line = line
+        self._wire = wire
         self._text = bytearray()
 
     def receive(self, data: bytes) -> None:
         """Act on bytes from the host."""
-        self._controller.check_plugged()
+        self._wire.check_plugged()
         for byte in data:
             if byte in CONTROL_BYTES:
                 self._answer(self._controller.control(byte))
@@ -689,18 +635,9 @@ class ControllerSession:
 
     def _answer(self, reply: str | None) -> None:
         if reply is not None:
-            self._controller.deliver(reply, self._line)
+            self._wire.deliver(reply.encode("latin-1") + b"\n", self._line)
 
 
 def shown(value: float | str) -> str:
     """Write a value as the controller does: floats with seven decimals, the rest as it is."""
     return f"{value:.7f}" if isinstance(value, float) else str(value)
-
-
-def scrambled(number: int, seed: int) -> int:
-    """Return 64 bits that look random and depend on nothing but the arguments (splitmix64)."""
-    mask = (1 << 64) - 1
-    bits = (number + 0x9E3779B97F4A7C15 * (seed + 1)) & mask
-    bits = ((bits ^ (bits >> 30)) * 0xBF58476D1CE4E5B9) & mask
-    bits = ((bits ^ (bits >> 27)) * 0x94D049BB133111EB) & mask
-    return bits ^ (bits >> 31)
