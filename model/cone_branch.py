@@ -7,11 +7,13 @@ the pressure has no lever and dPi/dr is negative, and it is positive above a bou
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from model.cone_terms import Cone, Driven, Edge, Isothermal, Number, Vented
+from model.cone_terms import Cone, Driven, Edge, Isothermal, Number, State, Vented
 from model.errors import NotConverged
 from model.prediction import Array
 from model.roots import EPSILON, bracketed
@@ -35,7 +37,8 @@ def bounds(cone: Cone, edge: Edge) -> tuple[Array, Array]:
         level = gas.anchor + gas.offset - edge.cap  # the volume at t = 0
         with np.errstate(divide="ignore", invalid="ignore"):
             empty = -level / widening
-            neutral = np.maximum((gas.neutral_growth + edge.cap) / widening, 0.0)
+            missing = np.maximum(gas.neutral_growth + edge.cap, 0.0)
+            neutral = np.where(missing > 0, missing / widening, 0.0)
             highest = np.where(level > 0, gas.at(-edge.cap)[0], np.inf)
             first = _balance(edge, np.maximum(highest, 0.0) * lever)
         second = np.maximum(neutral, _balance(edge, 0.0))
@@ -72,7 +75,7 @@ def largest_slope(cone: Cone, edge: Edge, start: Array | None = None) -> Array:
         step = np.abs(proposal - t)
         t = proposal
         scale = np.abs(t) + edge.slope
-        if ((step <= 8 * EPSILON * scale) | ((step <= NOISE * scale) & (step >= previous / 2))).all():
+        if ((step <= 8 * EPSILON * scale) | ((step <= NOISE * scale) & (step >= previous))).all():
             return t
         previous = step
     raise NotConverged(f"the equilibrium branch did not settle: largest last step {step.max():.3g} in the cone's slope")
@@ -108,6 +111,18 @@ def _last_crossing(cone: Cone, edge: Edge, gas: Driven, low: Array, high: Array)
     return t[rows, last], t[rows, last + 1]
 
 
+def _tilt(state: State) -> float:
+    """Return -dt/drho along the branch; zero where nothing but geometry shapes it (no load, no pressure)."""
+    return float(state.residual_radius / state.residual_t) if state.residual_t else 0.0
+
+
+def _tilts(state: State) -> Array:
+    """Return ``_tilt`` for arrays."""
+    shaped = state.residual_t != 0
+    result: Array = np.where(shaped, state.residual_radius / np.where(shaped, state.residual_t, 1.0), 0.0)
+    return result
+
+
 @dataclass(frozen=True)
 class Point:
     """One equilibrium of the branch."""
@@ -129,7 +144,7 @@ class Branch:
         self.t = largest_slope(cone, self.edge)
         state = cone.state(self.edge, self.t)
         self.force = state.force
-        tilt = state.residual_radius / state.residual_t
+        tilt = _tilts(state)
         self.position = cone.position(self.edge, self.t)
         self.climb = -(self.t + self.edge.slope) - self.edge.gap * tilt
         self.force_climb = state.force_radius - state.force_t * tilt
@@ -140,17 +155,23 @@ class Branch:
         """Add the limit r -> 0: the cone of an inflated membrane touching the apex, or no contact at z = 0."""
         t = self._centre()
         edge = self.cone.edge(0.0)
-        climb, force_climb = (1.0 if self.cone.adhesion > 0 else -1.0), 0.0
-        if t > 0:
-            state = self.cone.state(edge, t)
-            tilt = state.residual_radius / state.residual_t
-            climb, force_climb = -t - tilt, state.force_radius - state.force_t * tilt
+        state = self.cone.state(edge, t)
+        slope = -_tilt(state) if t > 0 else self._slope_at_apex(state.pressure)
+        climb = slope - t
+        force_climb = state.force_radius + state.force_t * slope if math.isfinite(slope) else -math.inf
         self.radius = np.append(self.radius, 0.0)
         self.t = np.append(self.t, t)
         self.position = np.append(self.position, t)
-        self.force = np.append(self.force, 0.0 if t > 0 else self.cone.state(edge, 0.0).force)
+        self.force = np.append(self.force, 0.0 if t > 0 else state.force)
         self.climb = np.append(self.climb, climb)
         self.force_climb = np.append(self.force_climb, force_climb)
+
+    def _slope_at_apex(self, pressure: float) -> float:
+        """Return dt/drho as r -> 0 without inflation: omega / |P_a| - 1 / r_b; infinite (rho^(1/4)) without suction."""
+        bend = 0.0 if self.cone.sphere is None else 1 / self.cone.sphere
+        if self.cone.adhesion == 0:
+            return -bend
+        return math.inf if pressure == 0 else self.cone.adhesion / -pressure - bend
 
     def _centre(self) -> float:
         edge = self.cone.edge(0.0)
@@ -186,15 +207,17 @@ class Branch:
         """Return dz/drho along the branch; negative where it is stable under displacement control."""
         edge, t = self.at(radius)
         state = self.cone.state(edge, t)
-        tilt = state.residual_radius / state.residual_t
+        tilt = _tilt(state)
         self._last = (radius, t, -tilt)
         return float(-(t + edge.slope) - edge.gap * tilt)
 
     def force_climb_at(self, radius: float) -> float:
         """Return dF/drho along the branch."""
+        if radius == 0.0:
+            return float(self.force_climb[-1])
         edge, t = self.at(radius)
         state = self.cone.state(edge, t)
-        tilt = state.residual_radius / state.residual_t
+        tilt = _tilt(state)
         self._last = (radius, t, -tilt)
         return float(state.force_radius - state.force_t * tilt)
 
@@ -213,15 +236,46 @@ class Branch:
 
     def turning(self, index: int) -> Point:
         """Return the extremum of z between the nodes ``index`` and ``index + 1``."""
-        return self._refine(self.climb_at, self.climb, index)
+        before, after = self.node(index), self.node(index + 1)
+        return self._solve(self.climb_at, before, after, float(self.climb[index]), float(self.climb[index + 1]))
 
-    def extremum_of_force(self, index: int) -> Point:
-        """Return the extremum of the force between the nodes ``index`` and ``index + 1``."""
-        return self._refine(self.force_climb_at, self.force_climb, index)
+    def lowest_force(self, before: Point, after: Point, slope_before: float, slope_after: float) -> Point:
+        """Return the minimum of the force between two points where dF/drho differs in sign."""
+        return self._solve(self.force_climb_at, before, after, slope_before, slope_after)
 
     def where_force_vanishes(self, before: Point, after: Point) -> Point:
-        """Return the zero of the force between two points of one stretch of the branch."""
-        return self._solve(lambda radius: self.point(radius).force, before, after, before.force, after.force)
+        """Return the zero of the force between two points of one stretch of the branch.
+
+        Without pressure the branch has an infinite slope dt/drho there, so not the force along the branch is solved
+        for zero but the residual along the curve on which the force vanishes.
+        """
+
+        def residual(radius: float) -> float:
+            edge = self.cone.edge(radius)
+            return float(self.cone.residual(edge, self._forceless(edge, before.t, after.t))[0])
+
+        low, high = residual(before.radius), residual(after.radius)
+        if not low > 0 > high:
+            return self._solve(lambda radius: self.point(radius).force, before, after, before.force, after.force)
+        radius = bracketed(residual, before.radius, after.radius, low, high)
+        edge = self.cone.edge(radius)
+        t = self._forceless(edge, before.t, after.t)
+        return Point(radius, t, self.cone.position(edge, t), 0.0)
+
+    def _forceless(self, edge: Edge, low: float, high: float) -> float:
+        """Return the slope t at which the force vanishes; the force falls with t."""
+
+        def force(t: float) -> float:
+            return float(self.cone.state(edge, t).force)
+
+        width = max(high - low, EPSILON)
+        while force(low) < 0 and low > -edge.slope:
+            low -= width
+            width *= 2
+        while force(high) > 0:
+            high += width
+            width *= 2
+        return bracketed(force, low, high, force(low), force(high))
 
     def where_position_is(self, position: float, before: Point, after: Point) -> Point:
         """Return the point at a height between those of two points of one stretch of the branch."""
@@ -233,14 +287,9 @@ class Branch:
             after.position - position,
         )
 
-    def _refine(self, function, values: Array, index: int) -> Point:  # type: ignore[no-untyped-def]
-        before, after = self.node(index), self.node(index + 1)
-        return self._solve(function, before, after, float(values[index]), float(values[index + 1]))
-
-    def _solve(self, function, before: Point, after: Point, value_before: float, value_after: float) -> Point:  # type: ignore[no-untyped-def]
-        self._last = (
-            before.radius,
-            before.t,
-            0.0 if before.radius == after.radius else (before.t - after.t) / (before.radius - after.radius),
-        )
+    def _solve(
+        self, function: Callable[[float], float], before: Point, after: Point, value_before: float, value_after: float
+    ) -> Point:
+        width = before.radius - after.radius
+        self._last = (before.radius, before.t, (before.t - after.t) / width if width else 0.0)
         return self.point(bracketed(function, before.radius, after.radius, value_before, value_after))

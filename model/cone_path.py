@@ -61,7 +61,7 @@ def _stretches(branch: Branch) -> list[Stretch]:
     trough: Point | None = None
     begin = 0
     last = len(branch.radius) - 1
-    falls = branch.climb >= 0  # z falls as the radius shrinks: unstable
+    falls = branch.climb > 0  # z falls as the radius shrinks: unstable
     landed: Point | None = branch.node(0)
     for index in range(last + 1):
         if index < last and not falls[index] and falls[index + 1]:
@@ -131,22 +131,19 @@ def strongest_pull(branch: Branch, path: Path) -> Point:
     """Return where the force is most tensile."""
     best = min(pinned_points(branch, path), key=lambda point: point.force)
     for stretch in path.stretches:
-        candidates = [stretch.first, stretch.last, *(branch.node(k) for k in stretch.nodes)]
-        lowest = min(candidates, key=lambda point: point.force)
-        for index in _force_minima(branch, stretch, lowest):
-            point = branch.extremum_of_force(index)
-            if stretch.last.radius <= point.radius <= stretch.first.radius and point.force < lowest.force:
-                lowest = point
-        best = min(best, lowest, key=lambda point: point.force)
+        best = min(best, _strongest_of(branch, stretch), key=lambda point: point.force)
     return best
 
 
-def _force_minima(branch: Branch, stretch: Stretch, lowest: Point) -> list[int]:
-    """Return the intervals of the scan around the lowest node in which dF/dr changes sign."""
-    around = np.searchsorted(-branch.radius, -lowest.radius)
-    last = len(branch.radius) - 2
-    return [
-        int(index)
-        for index in range(max(around - 2, 0), min(around + 1, last) + 1)
-        if branch.force_climb[index] > 0 > branch.force_climb[index + 1]
-    ]
+def _strongest_of(branch: Branch, stretch: Stretch) -> Point:
+    """Return the lowest force of a stretch: a node, or the minimum between two whose slopes dF/dr differ in sign."""
+    points = [stretch.first, *(branch.node(k) for k in stretch.nodes), stretch.last]
+    lowest = min(range(len(points)), key=lambda k: points[k].force)
+    around = range(max(lowest - 1, 0), min(lowest + 1, len(points) - 1) + 1)
+    slopes = {k: branch.force_climb_at(points[k].radius) for k in around}
+    best = points[lowest]
+    for k in around[:-1]:
+        if slopes[k] > 0 > slopes[k + 1]:
+            inner = branch.lowest_force(points[k], points[k + 1], slopes[k], slopes[k + 1])
+            best = min(best, inner, key=lambda point: point.force)
+    return best
