@@ -2,12 +2,8 @@
 
 Between contact line and rim the meridian is a straight line plus a parabolic bulge in equilibrium with the gas
 (a two-parameter Ritz shape); the material is neo-Hookean without hoop stretch. The energy release rate is the
-derivative of that potential with respect to the contact area. The contact line
-
-- recedes when the release rate exceeds ``receding``, at a rate that grows with the excess (a power law, as
-  polymers peel), and runs away where no equilibrium is left;
-- advances when the release rate of zipping falls below ``advancing``, or where the film would enter the substrate;
-- otherwise stays pinned. The two energies differ: adhesion hysteresis.
+derivative of that potential with respect to the contact area. The contact line recedes, stays pinned or advances
+as ``ContactLine`` says; where the film would enter the substrate it advances.
 
 Beside the contact, the film-covered rim of the gripper touches the substrate, slightly tilted, and takes the preload.
 """
@@ -15,10 +11,11 @@ Beside the contact, the film-covered rim of the gripper touches the substrate, s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from drivers.emulated.chamber import ATMOSPHERE, Chamber
-from drivers.emulated.specimens import RADIUS_TOLERANCE, State, finish
+from drivers.emulated.line import ContactLine, line_error
+from drivers.emulated.specimens import State, finish
 
 FREE_DEFLECTION = 0.59488
 """Pole of a clamped, inflated membrane over R_0 (p R_0 / E h)^(1/3), Poisson's ratio 1/2 (Hencky)."""
@@ -28,9 +25,6 @@ FREE_VOLUME = 0.965163
 
 SEED_RADIUS = 60e-6
 """A contact begins and ends at this radius, about one fibre, m."""
-
-FASTEST = 5.0
-"""Contact lines do not outrun this, m/s."""
 
 PRESSURE_STEP = 5.0
 """Newton's correction (Pa) below which the remaining error is far under the sensor's noise."""
@@ -55,12 +49,8 @@ class AdhesiveMembrane:
         R_0 and the largest contact radius misalignment and imperfections allow, m.
     youngs_modulus, thickness, prestretch
         Pa, m, strain the film was mounted with.
-    receding, advancing
-        Work of adhesion at zero speed of a receding and an advancing line, J/m^2.
-    line_speed, rate_exponent
-        w = receding (1 + (v / line_speed)^rate_exponent), m/s.
-    advancing_speed
-        Largest speed of an advancing line, m/s.
+    line
+        How the contact line moves.
     contact_strain
         The film laid on a sphere stores E h a^4 / (contact_strain r_b^4) per area.
     rim_stiffness, tilt
@@ -74,11 +64,7 @@ class AdhesiveMembrane:
     youngs_modulus: float = 2.08e6
     thickness: float = 196e-6
     prestretch: float = 2e-3
-    receding: float = 3.7
-    advancing: float = 0.2
-    line_speed: float = 1.0
-    rate_exponent: float = 0.35
-    advancing_speed: float = 0.05
+    line: ContactLine = field(default_factory=ContactLine)
     contact_strain: float = 270.0
     rim_stiffness: float = 60e3
     tilt: float = 1e-3
@@ -104,7 +90,7 @@ class AdhesiveMembrane:
         slip = 0.0
         if after[4] != state.speed:
             better = min(state.radius + 0.5 * (state.speed + after[4]) * duration, self.largest_radius)
-            slip = abs(better - radius) / (RADIUS_TOLERANCE + 0.05 * abs(radius - state.radius))
+            slip = line_error(better - radius, radius - state.radius)
             if slip > 0.1 and better > SEED_RADIUS:
                 after = self._balance(state, better, *world)
         return finish(state, duration, *after, slip)
@@ -194,7 +180,7 @@ class AdhesiveMembrane:
         return self.youngs_modulus * self.thickness
 
     def _laid_on(self, a: float) -> tuple[float, float, float, float]:
-        """Height, edge slope and volume of the cap of radius ``a``, and the energy (J/m^2) of laying film at its edge."""
+        """Height, edge slope and volume of the cap of radius ``a``, and the energy (J/m^2) of laying film there."""
         if self.substrate_diameter is None:
             return 0.0, 0.0, 0.0, 0.0
         sphere = 0.5 * self.substrate_diameter
@@ -227,9 +213,7 @@ class AdhesiveMembrane:
         energy = film / 6
         base = self.prestretch * (2 + self.prestretch)
         vented = chamber.vented
-        y, z, p = state.stretch, state.height, state.pressure
-        if state.radius == 0.0:
-            y = base
+        y, z, p = state.stretch if state.radius else base, state.height, state.pressure
         for _ in range(ITERATIONS):
             d = z + cap
             inclined = base + (d / L) ** 2
@@ -270,20 +254,10 @@ class AdhesiveMembrane:
             + laid
             - p * ((cap_slope * cone + pi / 3 * d * (2 * a + R)) / (2 * pi * a) - 0.5 * a * cap_slope + 2 / 3 * b)
         )
-        speed = self._line_speed(a, release, (d + 4 * b) / L + cap_slope, energy * x * math.sqrt(1 + y))
+        angle = (d + 4 * b) / L + cap_slope
+        zipping = energy * x * math.sqrt(1 + y) * angle * abs(angle)
+        speed = self.line.speed(release, zipping, movable=a < self.largest_radius)
         return stiffness * (z - height), p, z, a, speed, y
-
-    def _line_speed(self, radius: float, release: float, angle: float, tension: float) -> float:
-        """Speed of the contact line from the energy release rate, and from the angle at which film would zip."""
-        excess = release / self.receding - 1
-        if excess > 0.0:
-            return -min(self.line_speed * math.pow(excess, 1 / self.rate_exponent), FASTEST)
-        if radius >= self.largest_radius:
-            return 0.0
-        lack = 1 - tension * angle * abs(angle) / self.advancing
-        if lack <= 0.0:
-            return 0.0
-        return self.advancing_speed * (1.0 if lack >= 1.0 else math.pow(lack, 1 / self.rate_exponent))
 
 
 def _density(y: float) -> float:

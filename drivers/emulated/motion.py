@@ -105,6 +105,10 @@ def _profile(
     return tuple(segments)
 
 
+FORGOTTEN = 50.0
+"""After so many time constants nothing is left of a lag."""
+
+
 class Carriage:
     """The carriage of a stage: a commanded trajectory and a position that follows it with a first-order lag.
 
@@ -187,9 +191,10 @@ class Carriage:
         commanded, velocity = segment.at(time)
         lag = self._lag
         offset = self._offsets[index]
-        if offset:
-            offset *= math.exp(-(time - segment.start) / lag)
-        return commanded - lag * (velocity - lag * segment.acceleration) + offset
+        elapsed = time - segment.start
+        if offset and elapsed < FORGOTTEN * lag:
+            commanded += offset * math.exp(-elapsed / lag)
+        return commanded - lag * (velocity - lag * segment.acceleration)
 
     def _now(self) -> tuple[float, float, float]:
         now = self._clock()

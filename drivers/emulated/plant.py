@@ -7,6 +7,7 @@ stage or pump, and depends on nothing else; so a run does not depend on how the 
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from collections.abc import Mapping
@@ -22,6 +23,8 @@ from drivers.emulated.noise import Drift, NoiseStream
 from drivers.emulated.specimens import Specimen, State
 from drivers.emulated.truth import Truth
 from drivers.emulated.world import Axis, Syringe
+
+Array = NDArray[np.float64]
 
 LONGEST_STEP = 0.02
 """s; also how far a quiet world is computed ahead."""
@@ -40,15 +43,18 @@ FAULTS: Mapping[str, Mapping[str, str]] = {
 
 
 class Knot(NamedTuple):
-    """The world at one instant."""
+    """The world at one instant, and what the sensors make of it but for noise."""
 
     time: float
     state: State
     amount: float
     relaxed: float
-    force: float
     sensed: float
-    supply: float
+    output: tuple[float, float, float]
+
+
+SIGNALS = ("force", "pressure", "supply")
+"""Order of ``Knot.output``."""
 
 
 class Plant:
@@ -115,12 +121,13 @@ class Plant:
 
     @property
     def state(self) -> State:
-        """The specimen at the last knot not later than now (truth, for tests and displays)."""
+        """The specimen now (truth, for tests and displays)."""
         with self.lock:
             self._extend(self._time)
-            return next(knot.state for knot in reversed(self._knots) if knot.time <= self._time)
+            last = next(knot for knot in reversed(self._knots) if knot.time <= self._time)
+            return last.state if self._time - last.time < ROUND_OFF else self._after(last, self._time).state
 
-    def advance(self, samples: int, rate: float) -> dict[str, NDArray[np.float64]]:
+    def advance(self, samples: int, rate: float) -> dict[str, Array]:
         """Move time on by ``samples / rate``; see ``World.advance``.
 
         The last of the samples is taken at the new present time.
@@ -135,20 +142,31 @@ class Plant:
             first = start - self._epoch_sample + 1
             times = self._epoch + np.arange(first, first + samples) / rate
             if samples:
-                self._extend(float(times[-1]))
-                self._time = float(times[-1])
+                self._extend(end := float(times[-1]))
+                self._time = end
                 self._sample = stop
-            knots = self._knots
-            grid = [knot.time for knot in knots]
-            noise = self._noise.take(start, stop)
             self.faults.advance(stop)
-            measured = {
-                "force": np.interp(times, grid, [knot.force for knot in knots]) + noise[0],
-                "pressure": np.interp(times, grid, [knot.sensed for knot in knots]) + noise[1],
-                "supply": np.interp(times, grid, [knot.supply for knot in knots]) + noise[2],
-            }
+            outputs = self._between_knots(times) + self._noise.take(start, stop)
             self._forget()
-            return measured
+            return dict(zip(SIGNALS, outputs, strict=True))
+
+    def _between_knots(self, times: Array) -> Array:
+        """Straight lines between the knots at the given times, shape (signals, times)."""
+        knots = self._knots
+        pieces = []
+        done = 0
+        for before, after in itertools.pairwise(knots):
+            if done == times.size:
+                break
+            upto = times.size if times[-1] <= after.time else int(np.searchsorted(times, after.time, side="right"))
+            if upto > done:
+                part = times[done:upto] - before.time
+                duration = after.time - before.time
+                lines = zip(before.output, after.output, strict=True)
+                slopes = np.array([[(end - start) / duration] for start, end in lines])
+                pieces.append(slopes * part + np.array(before.output)[:, None])
+                done = upto
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces or [np.empty((len(SIGNALS), 0))], axis=1)
 
     def _now(self) -> float:
         return self._time
@@ -185,22 +203,17 @@ class Plant:
         state = self._specimen.step(last.state, duration, height, delivered, amount, chamber, train.stiffness)
         pushed = state.force if state.force > 0.0 else 0.0
         relaxed = pushed + (last.relaxed - pushed) * math.exp(-duration / train.relaxation_time)
-        sensed = chamber.sensed(
-            last.sensed - self._pressure_drift.at(last.time), last.state.pressure, state.pressure, duration
-        )
+        sensed = chamber.sensed(last.sensed, last.state.pressure, state.pressure, duration)
         return self._knot(time, state, amount, relaxed, sensed)
 
     def _knot(self, time: float, state: State, amount: float, relaxed: float, sensed: float) -> Knot:
         """Add to a state what the sensors make of it."""
-        return Knot(
-            time,
-            state,
-            amount,
-            relaxed,
+        output = (
             state.force - self.truth.train.relaxing * relaxed + self._force_drift.at(time),
             sensed + self._pressure_drift.at(time),
             self.truth.disturbance.supply + self._supply_drift.at(time),
         )
+        return Knot(time, state, amount, relaxed, sensed, output)
 
     def _settle(self) -> None:
         """Make now a knot and forget what was computed beyond: a command is about to change the future."""

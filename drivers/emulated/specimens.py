@@ -49,9 +49,6 @@ class State(NamedTuple):
 FORCE_TOLERANCE = 5e-4
 """How far (N) a step may leave the straight line of the one before."""
 
-RADIUS_TOLERANCE = 2e-6
-"""Allowed error of the contact radius in one step, m, besides a twentieth of its change."""
-
 
 class Specimen(Protocol):
     """Anything the gripper can be brought onto. Immutable."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
@@ -105,8 +104,7 @@ class Truth:
             effective_radius=min(effective_radius * (1 - 0.012 * abs(draw())), 0.99 * radius),
             youngs_modulus=nominal.youngs_modulus * (1 + 0.02 * draw()),
             thickness=nominal.thickness * (1 + 0.02 * draw()),
-            receding=nominal.receding * (1 + 0.03 * draw()),
-            advancing=nominal.advancing * math.exp(0.2 * draw()),
+            line=nominal.line.varied(draw(), draw()),
             tilt=abs(1.0e-3 + 0.5e-3 * draw()),
         )
         chamber = Chamber(
