@@ -107,15 +107,20 @@ def solve(
     counter = Counter()
     prediction = Prediction("membrane", Outcome.NO_ADHESION, assumptions)
     if parameters.membrane.work_of_adhesion > 0:
-        scaled = scene(parameters, stretch, tension_field=tension_field, counter=counter)
-        prediction = _solve(scaled, prediction, points, tolerance, counter)
+        scaled = scene(parameters, stretch, tension_field=tension_field)
+        if parameters.gas.anchor is GasAnchor.START:
+            anchored = _anchored_at_start(scaled.annulus, scaled.width, scaled.start, counter)
+        else:
+            anchored = scaled.annulus
+        if isinstance(anchored, Outcome):
+            prediction = replace(prediction, outcome=anchored)
+        else:
+            prediction = _solve(replace(scaled, annulus=anchored), prediction, points, tolerance, counter)
     return replace(prediction, runtime_s=time.perf_counter() - began, evaluations={"membrane states": counter.states})
 
 
-def scene(
-    parameters: Parameters, stretch: ContactStretch, *, tension_field: bool = False, counter: Counter | None = None
-) -> Scene:
-    """Return the scene in scaled units: lengths by R_0, tensions by E_m h_0 / 3."""
+def scene(parameters: Parameters, stretch: ContactStretch, *, tension_field: bool = False) -> Scene:
+    """Return the scene in scaled units: lengths by R_0, tensions by E_m h_0 / 3; gas anchored at V_0 or held."""
     gripper, membrane, substrate = parameters.gripper, parameters.membrane, parameters.substrate
     length = gripper.radius
     tension = membrane.youngs_modulus * membrane.thickness / 3
@@ -130,8 +135,6 @@ def scene(
         contact=contact_map(stretch),
         tension_field=tension_field,
     )
-    if parameters.gas.anchor is GasAnchor.START:
-        annulus = _anchored_at_start(annulus, width, start, counter or Counter())
     return Scene(annulus, start, width, length, tension * length, pressure)
 
 
@@ -151,13 +154,19 @@ def _gas(parameters: Parameters, length: float, unit: float) -> Gas:
     )
 
 
-def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Counter) -> Annulus:
+def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Counter) -> Annulus | Outcome:
     """Return the annulus whose gas has P_0 at the volume of the pinned state at z_0."""
-    state = pinned_state(annulus, width, start, counter)
-    if state is None:
-        raise NotConverged("membrane: the state at the start of retraction could not be solved to anchor the gas there")
-    change = float(shape(annulus, np.array([width]), state).volume_change[0])
-    return replace(annulus, gas=replace(annulus.gas, volume=annulus.gas.free_volume + change))
+    gas, change = annulus.gas, 0.0
+    if annulus.surface.curvature > 0 or gas.pressure != 0:  # else flat and unstressed
+        found = pinned_state(annulus, width, start, counter)
+        if found.state is None and not found.turned:
+            raise NotConverged("membrane: the state at the start of retraction could not be solved to anchor the gas")
+        if found.state is None:
+            return Outcome.NO_EQUILIBRIUM
+        change = float(shape(annulus, np.array([width]), found.state).volume_change[0])
+    if gas.free_volume + change <= 0:
+        return Outcome.CHAMBER_CLOSED
+    return replace(annulus, gas=replace(gas, volume=gas.free_volume + change))
 
 
 def _solve(scaled: Scene, empty: Prediction, points: int, tolerance: float, counter: Counter) -> Prediction:

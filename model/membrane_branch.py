@@ -23,6 +23,10 @@ COARSE_ORDER = 10
 SMALLEST_CONTACT = 3.9
 """Width ln(R_0 / a) to which a branch is followed at first, a = 0.02 R_0."""
 LAST_WIDTH = 14.0
+NARROW_STRIP = 0.05
+"""Width at which the closed form of the strip starts every solution."""
+FOLD_RATE = 5.0
+"""Logarithmic rate of change at which a line that ends counts as turned: O(1) on a smooth one, unbounded at a fold."""
 LARGEST_SURPRISE = 0.5
 """How far a state may lie from its prediction before the step counts as a leap to another solution."""
 
@@ -83,32 +87,67 @@ def _predict(places: list[float], states: list[Array], place: float) -> Array:
     return states[-1] + fraction * (states[-1] - states[-2])
 
 
-def release_state(annulus: Annulus, width: float, counter: Counter, order: int = COARSE_ORDER) -> Array | None:
-    """Return the state (1, m) that peels at the given width, reached from a strip by raising curvature and pressure."""
+class Start(NamedTuple):
+    """The end of raising a scene's load: its state (1, m), or ``None`` with the reason.
+
+    ``turned``: the solution turned back at a part of the load, beyond which there is no equilibrium of this kind.
+    """
+
+    state: Array | None
+    turned: bool
+
+
+def release_state(annulus: Annulus, width: float, counter: Counter, order: int = COARSE_ORDER) -> Start:
+    """Return the state that peels at the given width, reached from a strip by raising curvature and pressure."""
     return _raise_load(annulus, width, Closure.RELEASE, 0.0, counter, order)
 
 
-def pinned_state(annulus: Annulus, width: float, height: float, counter: Counter) -> Array | None:
-    """Return the state (1, m) with the contact line held at the given width and the rim at ``height``."""
+def pinned_state(annulus: Annulus, width: float, height: float, counter: Counter) -> Start:
+    """Return the state with the contact line held at the given width and the rim at ``height``."""
     return _raise_load(annulus, width, Closure.HEIGHT, height, counter, COARSE_ORDER)
 
 
-def _raise_load(
-    annulus: Annulus, width: float, closure: Closure, height: float, counter: Counter, order: int
-) -> Array | None:
-    widths = np.array([width])
+def _raise_load(annulus: Annulus, width: float, closure: Closure, height: float, counter: Counter, order: int) -> Start:
     flat = _at_fraction(annulus, 0.0)
-    start = counter.note(solve(flat, widths, strip(annulus.work, order), iterations=20))
-    if not start.converged[0]:
-        return None
-    rest = float(shape(flat, widths, start.state).height[0])
+    rest = _flat_state(flat, width, counter, order)
+    if rest is None:
+        return Start(None, turned=False)
+    widths = np.array([width])
+    lifted = float(shape(flat, widths, rest).height[0])
 
     def solve_at(fraction: float, guess: Array) -> Array | None:
-        target = (1 - fraction) * rest + fraction * height
+        target = (1 - fraction) * lifted + fraction * height
         return _accepted(_at_fraction(annulus, fraction), widths, guess, closure, target, counter)
 
-    line = follow(solve_at, 0.0, start.state, 1.0, step=0.5, smallest=2e-3)
-    return line.state[-1:] if line.coordinate[-1] == 1.0 else None
+    line = follow(solve_at, 0.0, rest, 1.0, step=0.5, smallest=1e-7)
+    if line.coordinate[-1] == 1.0:
+        return Start(line.state[-1:], turned=False)
+    return Start(None, turned=_turned(line, widths))
+
+
+def _flat_state(flat: Annulus, width: float, counter: Counter, order: int) -> Array | None:
+    """Return the peeling state on a flat without pressure: from a narrow strip to the given width."""
+    narrow = min(width, NARROW_STRIP)
+    solved = counter.note(solve(flat, np.array([narrow]), strip(flat.work, order), iterations=20))
+    if not solved.converged[0]:
+        return None
+    if narrow == width:
+        return solved.state
+
+    def solve_at(place: float, guess: Array) -> Array | None:
+        return _accepted(flat, np.array([place]), guess, Closure.RELEASE, 0.0, counter)
+
+    line = follow(solve_at, narrow, solved.state, width, step=0.2, smallest=1e-4)
+    return line.state[-1:] if line.coordinate[-1] == width else None
+
+
+def _turned(line: Line, widths: Array) -> bool:
+    """Whether a line ended at a fold, where its state changes without bound by the load."""
+    if line.coordinate.size < 3:
+        return False
+    gained = line.coordinate[-1] - line.coordinate[-2]
+    change = relative_size(line.state[-1:], line.state[-1:] - line.state[-2:-1], widths)[0]
+    return bool(change * line.coordinate[-1] > FOLD_RATE * gained)
 
 
 def _at_fraction(annulus: Annulus, fraction: float) -> Annulus:
@@ -155,38 +194,41 @@ def release_branch(annulus: Annulus, width: float, height: float, counter: Count
     Raises
     ------
     NotConverged
-        Not even pinned states at z_0 could be solved.
+        No state was found, and nothing says that there is none.
     """
     starts = width + np.array([0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6])
+    turned = False
     for start in map(float, starts):
-        state = release_state(annulus, start, counter)
-        if state is not None:
-            return _both_ways(annulus, start, state, width, counter)
-    solved = 0
-    for start in map(float, starts):
+        found = release_state(annulus, start, counter)
+        if found.state is not None:
+            return _both_ways(annulus, start, found.state, width, counter)
+        turned = turned or found.turned
+    for start in map(float, starts[::2]):
         pinned = pinned_state(annulus, start, height, counter)
-        if pinned is None:
+        turned = turned or pinned.turned
+        if pinned.state is None:
             continue
-        solved += 1
-        state = _lift_until_release(annulus, start, pinned, height, counter)
+        state, peels = _lift_until_release(annulus, start, pinned.state, height, counter)
         if state is not None:
             return _both_ways(annulus, start, state, width, counter)
-    if solved == 0:
-        raise NotConverged("membrane: no state at the start of retraction could be solved; the scene is too extreme")
+        turned = turned or peels
+    if not turned:
+        raise NotConverged("membrane: no peeling state could be solved; the scene is too extreme for the solver")
     return None
 
 
-def _lift_until_release(annulus: Annulus, width: float, state: Array, height: float, counter: Counter) -> Array | None:
-    """Raise the rim of a pinned state until it peels; ``None`` if it peels at once, or never within R_0."""
+def _lift_until_release(
+    annulus: Annulus, width: float, state: Array, height: float, counter: Counter
+) -> tuple[Array | None, bool]:
+    """Raise the rim of a pinned state until it peels; also say whether it peels at once."""
     line = pinned_line(annulus, width, state, height, height + 1.0, counter)
     widths = np.full(line.coordinate.size, width)
     lifted = shape(annulus, widths, line.state)
     holds = (lifted.release < annulus.work) | (lifted.peel_angle <= 0)
     if not holds[0] or holds.all():
-        return None
-    return _accepted(
-        annulus, widths[:1], line.state[[int(np.argmin(holds))]], Closure.RELEASE, 0.0, counter, surprise=np.inf
-    )
+        return None, not holds[0]
+    guess = line.state[[int(np.argmin(holds))]]
+    return _accepted(annulus, widths[:1], guess, Closure.RELEASE, 0.0, counter, surprise=np.inf), False
 
 
 def _both_ways(annulus: Annulus, start: float, state: Array, width: float, counter: Counter) -> Line:

@@ -115,7 +115,8 @@ class Gas:
 class Annulus:
     """One scene in scaled units; states are rows (u, Q, p, f) with u = r - R and Q at the nodes.
 
-    ``work`` is the work of adhesion over mu h_0; ``contact`` takes reference radii to the substrate.
+    ``work`` is the work of adhesion over mu h_0; ``contact`` takes reference radii to the substrate. The rim holds the
+    membrane at ``prestretch`` times its reference radius.
     """
 
     surface: Surface
@@ -123,6 +124,7 @@ class Annulus:
     work: float
     contact: ContactMap
     tension_field: bool = False
+    prestretch: float = 1.0
 
 
 class Closure(Enum):
@@ -222,7 +224,7 @@ def residual_and_jacobian(
     residual[:, :order] = s.r_slope - (lam - 1) * c + np.where(c > 0, si**2 / (1 + np.abs(c)), 1 - c)
     residual[:, order : 2 * order] = s.q_slope - w2 + p * r * lam * si
     residual[:, -4] = s.gap / s.width
-    residual[:, -3] = s.rim / s.width
+    residual[:, -3] = (s.rim - (annulus.prestretch - 1)) / s.width
 
     # Partial derivatives of X = lambda_1 cos(psi), Y = lambda_1 sin(psi) and w_2 by Q, P and r.
     AR, bend = A / s.R, lam / s.N

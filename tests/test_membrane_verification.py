@@ -1,0 +1,207 @@
+"""The verification ladder of the membrane solver: closed forms, limits, identities, each with its order."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from model.membrane_branch import Counter, release_branch, release_state
+from model.membrane_contact import Contact, ContactStretch, Surface, contact_map
+from model.membrane_equilibrium import Annulus, Closure, Gas, residual_and_jacobian, shape, solve, strip
+
+VENTED = Gas(0.0, 5.8, math.inf, 14.0)
+FLAT = Surface(0.0)
+
+
+def annulus(work, *, gas=VENTED, curvature=0.0, stretch=ContactStretch.PROJECTED, **options):
+    return Annulus(Surface(curvature), gas, work, contact_map(stretch), **options)
+
+
+def boyle(pressure, volume=14.0):
+    return Gas(pressure, 5.8, volume, volume)
+
+
+def state_at(problem, a, order=16):
+    width = np.array([-math.log(a)])
+    start = release_state(problem, float(width[0]), Counter(), order)
+    assert start.state is not None
+    return width, start.state
+
+
+@pytest.mark.parametrize("gas", [boyle(-0.057), Gas(0.1, 5.8, math.inf, 14.0)])
+@pytest.mark.parametrize("closure", list(Closure))
+@pytest.mark.parametrize("tension_field", [False, True])
+def test_jacobian_is_the_derivative_of_the_residual(gas, closure, tension_field):
+    rng = np.random.default_rng(1)
+    problem = annulus(0.03, gas=gas, curvature=0.27, stretch=ContactStretch.EML, tension_field=tension_field)
+    state = strip(0.03, 6) * (1 + 0.1 * rng.random((1, 16)))
+    state[0, :7] += 0.05 * rng.random(7)
+    state[0, -2] = -0.05
+    width, target = np.array([0.5]), np.array([0.2])
+    _, jacobian = residual_and_jacobian(problem, width, state, closure, target)
+    for column in range(state.size):
+        step = np.zeros_like(state)
+        step[0, column] = 1e-6
+        ahead = residual_and_jacobian(problem, width, state + step, closure, target)[0]
+        behind = residual_and_jacobian(problem, width, state - step, closure, target)[0]
+        assert jacobian[0, :, column] == pytest.approx((ahead - behind)[0] / 2e-6, rel=1e-6, abs=1e-7)
+
+
+def test_measured_pressure_enters_the_jacobian():
+    gas = Gas(0.0, 5.8, math.inf, 14.0, measured=(np.array([-1.0, 0.0, 0.4]), np.array([0.1, 0.2, -0.3])))
+    problem = annulus(0.03, gas=gas)
+    state, width, target = strip(0.03, 5), np.array([0.5]), np.array([0.0])
+    _, jacobian = residual_and_jacobian(problem, width, state, Closure.RELEASE, target)
+    step = np.zeros_like(state)
+    step[0, -1] = 1e-6
+    ahead = residual_and_jacobian(problem, width, state + step, Closure.RELEASE, target)[0]
+    behind = residual_and_jacobian(problem, width, state - step, Closure.RELEASE, target)[0]
+    assert jacobian[0, :, -1] == pytest.approx((ahead - behind)[0] / 2e-6, rel=1e-6, abs=1e-8)
+
+
+def test_strip_limit_is_reached_at_first_order():
+    """a -> R_0, p = 0: w_1 (l - 1/l) - w = omega / T with l = 1 / cos(theta); E 2.1 MPa, 0.2 mm, 4 J/m^2."""
+    tension = 2.1e6 * 2e-4 / 3
+    work = 4.0 / tension
+    limit = strip(work, 4)
+    force = 2 * math.pi * limit[0, -1] * tension * 8e-3
+    assert force == pytest.approx(0.696597, abs=1e-6)
+    errors = []
+    for gap in (1e-2, 1e-3, 1e-4):
+        width, state = state_at(annulus(work), 1 - gap)
+        angle = math.degrees(float(shape(annulus(work), width, state).peel_angle[0]))
+        errors.append(angle - math.degrees(math.atan2(limit[0, -1], limit[0, 5])))
+    assert math.degrees(math.atan2(limit[0, -1], limit[0, 5])) == pytest.approx(21.5207, abs=1e-4)
+    assert np.log10(np.array(errors[:-1]) / errors[1:]) == pytest.approx([1, 1], abs=0.05)
+
+
+def fold_of(problem, near):
+    """Return radius, height and pull (over 2 pi) at the highest point of the branch, by a local series."""
+    places = np.linspace(near - 0.2, near + 0.2, 41)
+    guess = release_branch(problem, 0.0917, 0.0, Counter()).guess(places)
+    solved = solve(problem, places, guess)
+    assert solved.converged.all()
+    height = np.polynomial.Chebyshev.fit(places, shape(problem, places, solved.state).height, 10)
+    fold = next(float(x.real) for x in height.deriv().roots() if abs(x.imag) < 1e-9 and abs(x.real - near) < 0.2)
+    pull = np.polynomial.Chebyshev.fit(places, solved.state[:, -1], 10)
+    return np.array([math.exp(-fold), height(fold), pull(fold)])
+
+
+def test_unstressed_small_strain_fold():
+    """nu = 1/2, p = 0: a* = 0.19192 R_0, z* = 0.68718 (w / E h)^(1/4) R_0, F* = 1.3406 E h R_0 (w / E h)^(3/4).
+
+    The limit is approached with the square root of the work of adhesion.
+    """
+    scaled = []
+    for work in (4e-6, 1e-6, 2.5e-7):
+        ratio = work / 3  # E h = 3 mu h
+        units = np.array([1.0, ratio**0.25, 3 * ratio**0.75 / (2 * math.pi)])
+        scaled.append(fold_of(annulus(work), math.log(1 / 0.192)) / units)
+    first, second, third = scaled
+    assert (first - second) / (second - third) == pytest.approx(2.0, rel=0.02)
+    assert 2 * third - second == pytest.approx([0.19192, 0.68718, 1.3406], abs=1e-4)
+
+
+def test_pretension_punch_limit():
+    """Membrane prestretched to l_0: fold at a* = R_0 / e, z* = (R_0 / e) sqrt(2 w / T), T = 1 - l_0^-6."""
+    prestretch, work = 1.2, 1e-8
+    T = 1 - prestretch**-6
+
+    def stretched(_: Surface, a):
+        zero, one = np.zeros_like(a), np.ones_like(a)
+        stored = 0.5 * (2 * prestretch**2 + prestretch**-4 - 3) * one
+        return Contact(prestretch * a, zero, prestretch * one, zero, stored)
+
+    problem = Annulus(FLAT, VENTED, work, stretched, prestretch=prestretch)
+    width = np.linspace(0.8, 1.2, 17)
+    order = 14
+    w1 = prestretch - prestretch**-5
+    R = np.exp(-width[:, None] * (1 - (1 - np.cos(np.pi * np.arange(order + 1) / order)) / 2))
+    state = np.zeros((width.size, 2 * order + 4))
+    state[:, : order + 1] = (prestretch - 1) * R
+    state[:, order + 1 : -2] = w1 * R
+    state[:, -1] = math.sqrt(2 * work / T) * T * prestretch * np.exp(-width)
+    solved = solve(problem, width, state)
+    assert solved.converged.all()
+    height = np.polynomial.Chebyshev.fit(width, shape(problem, width, solved.state).height, 12)
+    fold = next(float(x.real) for x in height.deriv().roots() if abs(x.imag) < 1e-9 and 0.8 < x.real < 1.2)
+    scale = prestretch * math.sqrt(2 * work / prestretch**2 / T)  # work is per reference area
+    assert math.exp(-fold) == pytest.approx(1 / math.e, rel=1e-6)
+    assert height(fold) == pytest.approx(scale / math.e, rel=1e-6)
+
+
+@pytest.mark.parametrize("gas", [VENTED, boyle(-0.05), boyle(0.08, volume=2.0)])
+def test_force_and_release_rate_are_differences_of_the_energy(gas):
+    """F = dPi/dz and G = -dPi/dA at fixed z, by central differences: second order."""
+    problem = annulus(0.0286, gas=gas, curvature=8 / 30, stretch=ContactStretch.PROJECTED)
+    width, state = state_at(problem, 0.7)
+    s = shape(problem, width, state)
+    height, a = float(s.height[0]), 0.7
+
+    def energy(a, height):
+        place = np.array([-math.log(a)])
+        solved = solve(problem, place, state, closure=Closure.HEIGHT, target=height, iterations=30)
+        assert solved.converged[0]
+        return float(total_energy(problem, place, solved.state)[0])
+
+    force, release = [], []
+    for step in (1e-2, 1e-3):
+        force.append((energy(a, height + step) - energy(a, height - step)) / (2 * step))
+        area = math.pi * ((a + step) ** 2 - (a - step) ** 2)
+        release.append((energy(a + step, height) - energy(a - step, height)) / area)
+    for differences, exact in ((force, 2 * math.pi * float(state[0, -1])), (release, problem.work)):
+        errors = np.array(differences) - exact
+        assert errors[0] / errors[1] == pytest.approx(100, rel=0.1)
+        assert (100 * differences[1] - differences[0]) / 99 == pytest.approx(exact, rel=1e-6)
+
+
+def total_energy(problem, width, state):
+    """Stretching of annulus and contact plus the work of the gas, over T* R_0^2; adhesion left out."""
+    s = shape(problem, width, state)
+    order = s.R.shape[1]
+    weights = np.polynomial.legendre.leggauss(order)[1] / 2
+    hoop = s.r / s.R
+    density = 0.5 * (s.stretch**2 + hoop**2 + (s.stretch * hoop) ** -2 - 3)
+    free = 2 * math.pi * (width[:, None] * weights * s.R**2 * density).sum(axis=1)
+    a = np.exp(-width)
+    radii = a * np.sqrt((np.polynomial.legendre.leggauss(40)[0] + 1) / 2)
+    quadrature = np.polynomial.legendre.leggauss(40)[1] / 2
+    released = problem.contact(problem.surface, radii).released
+    contact = math.pi * a**2 * (quadrature * released).sum()
+    gas, change = problem.gas, s.volume_change
+    if gas.held:
+        return free + contact - gas.pressure * change
+    ratio = np.log1p(change / gas.free_volume)
+    work = gas.atmosphere * change - (gas.atmosphere + gas.pressure) * gas.volume * ratio
+    return free + contact + work
+
+
+@pytest.mark.parametrize("pressure", [-0.16, -0.05, 0.0, 0.05])
+@pytest.mark.parametrize("a", [0.2, 0.5, 0.85])
+def test_cone_energy_is_an_upper_bound_on_a_flat(pressure, a):
+    problem = annulus(0.0286, gas=boyle(pressure))
+    width, state = state_at(problem, a)
+    height = float(shape(problem, width, state).height[0])
+    stretch = math.hypot(1, height / (1 - a))
+    change = math.pi * height * (1 + a + a * a) / 3
+    gas = problem.gas
+    work = gas.atmosphere * change - (gas.atmosphere + gas.pressure) * gas.volume * math.log1p(change / gas.volume)
+    cone = math.pi * (1 - a * a) * 0.5 * (stretch - 1 / stretch) ** 2 + work
+    assert float(total_energy(problem, width, state)[0]) <= cone
+
+
+def test_collocation_converges_spectrally():
+    problem = annulus(0.0286, gas=boyle(-0.15), curvature=8 / 30)
+    _, reference = state_at(problem, 0.3, 30)
+    errors = [abs(float(state_at(problem, 0.3, order)[1][0, -1] / reference[0, -1]) - 1) for order in (4, 6, 8, 10)]
+    assert all(after < 0.1 * before for before, after in pairwise(errors))
+    assert errors[-1] < 1e-8
+
+
+def test_tension_field_only_removes_energy():
+    taut = annulus(0.0286, gas=boyle(-0.05))
+    slack = annulus(0.0286, gas=boyle(-0.05), tension_field=True)
+    width, state = state_at(taut, 0.5)
+    assert (shape(taut, width, state).hoop_tension > 0).all()
+    assert state_at(slack, 0.5)[1] == pytest.approx(state, rel=1e-9, abs=1e-12)
