@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
 import numpy as np
 
 from drivers.emulated.chamber import Chamber
+from drivers.emulated.fibers import FewFibers, RigidPunch
+from drivers.emulated.indentation import Indentation
 from drivers.emulated.membrane import AdhesiveMembrane
-from drivers.emulated.specimens import Specimen
+from drivers.emulated.soft import SoftGripper
+from drivers.emulated.specimens import ClosedChamber, Specimen
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,3 +118,47 @@ class Truth:
         )
         train = Train(contact_position=20e-3 + 20e-6 * draw(), stiffness=84e3 * (1 + 0.02 * draw()))
         return cls(specimen, chamber, train)
+
+    @classmethod
+    def indentation(cls, *, seed: int = 0) -> Self:
+        """Return the film on its glass plate under a 4 mm sphere, as in PNAS SI S4; another spot for every seed."""
+        draw = np.random.default_rng([seed, 0x1DE7]).normal
+        nominal = Indentation()
+        spot = replace(nominal, modulus=nominal.modulus * (1 + 0.03 * draw()), line=nominal.line.varied(draw(), draw()))
+        return cls(spot, Chamber(vented=True), Train(contact_position=20e-3 + 20e-6 * draw()))
+
+    @classmethod
+    def fibers(cls, *, seed: int = 0) -> Self:
+        """Return three single fibres as in PNAS SI S5, under the soft load cell such forces need."""
+        draw = np.random.default_rng([seed, 0xF1BE]).normal
+        nominal = FewFibers()
+        sample = replace(nominal, strengths=tuple(strength * (1 + 0.08 * draw()) for strength in nominal.strengths))
+        train = Train(stiffness=1.2e3, contact_position=20e-3 + 20e-6 * draw())
+        return cls(sample, Chamber(vented=True), train, Disturbance(4e-6, 5e-8, 4e-6))
+
+    @classmethod
+    def punch(cls, *, radius: float = 7.3e-3, seed: int = 0) -> Self:
+        """Return fibres on a rigid punch above flat glass, as in EML 2020 Fig. 3e."""
+        draw = np.random.default_rng([seed, 0xFA2B]).normal
+        nominal = RigidPunch()
+        punch = replace(
+            nominal,
+            radius=radius,
+            strength=nominal.strength * (1 + 0.04 * draw()),
+            tilt=nominal.tilt * (1 + 0.1 * draw()),
+        )
+        return cls(punch, Chamber(vented=True), Train(contact_position=20e-3 + 20e-6 * draw()))
+
+    @classmethod
+    def soft(cls, diameter: float | None = None, *, chamber_volume: float = 7.2e-6, seed: int = 0) -> Self:
+        """Return the soft gripper on a glass sphere of this diameter (m) or on a flat: empirical, after Table S2."""
+        draw = np.random.default_rng([seed, 0x50F7]).normal
+        gripper = SoftGripper(math.inf if diameter is None else diameter, factor=1 + 0.03 * draw())
+        chamber = Chamber(volume=chamber_volume * (1 + 0.004 * draw()))
+        return cls(gripper, chamber, Train(contact_position=20e-3 + 20e-6 * draw()))
+
+    @classmethod
+    def closed(cls, *, chamber_volume: float = 7.2e-6, leak_time: float = 3000.0, seed: int = 0) -> Self:
+        """Return the chamber closed by a plate, for leak and volume tests."""
+        draw = np.random.default_rng([seed, 0xC105]).normal
+        return cls(ClosedChamber(), Chamber(chamber_volume * (1 + 0.004 * draw()), leak_time=leak_time))
