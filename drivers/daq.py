@@ -268,6 +268,8 @@ class NIDaq:
             The answer cannot be understood.
         """
         self._check_open()
+        if not self._running:
+            raise CommandRefused("daq", "the sample clock is not running.", "start the DAQ first.")
         data = np.full((len(self._channels), samples), np.nan)
         kept = min(self._partial.shape[1], samples)
         if not kept:

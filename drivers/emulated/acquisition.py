@@ -64,6 +64,7 @@ class Acquisition:
         self._world, self._electronics, self._pace = world, electronics, pace
         self._buffer, self._total = buffer, total
         self._blocks: deque[Array] = deque()
+        self._nothing = np.empty((electronics.channels, 0))
         self._lock = threading.Lock()
         self._overwritten = False
         self.available = 0
@@ -145,7 +146,7 @@ class Acquisition:
             if self._blocks and self._blocks[0].shape[1] == samples:
                 taken = self._blocks.popleft()
             else:
-                waiting = np.concatenate(self._blocks, axis=1) if self._blocks else np.empty((0, 0))
+                waiting = np.concatenate(self._blocks, axis=1) if self._blocks else self._nothing
                 taken = waiting[:, :samples]
                 self._blocks = deque([waiting[:, samples:]] if waiting.shape[1] > samples else [])
             self.available -= taken.shape[1]

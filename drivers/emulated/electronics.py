@@ -299,6 +299,11 @@ class Electronics:
         stream = zlib.crc32(repr((seed, run, [wanted.physical for wanted in inputs])).encode())
         self._noise = NoiseStream(stream, (*noise[:, 0].tolist(), *[1.0] * len(inputs)))
 
+    @property
+    def channels(self) -> int:
+        """Number of rows ``digitise`` returns."""
+        return len(self._rows)
+
     def digitise(self, truth: Mapping[str, Array]) -> Array:
         """Return what the device delivers (channels, n) for the plant's next n samples."""
         start, stop = self._next, self._next + truth["force"].size
