@@ -33,7 +33,8 @@ def rounding(cone: Cone, edge: Edge, t: float) -> tuple[float, float, float]:
     residual = (1 + radius) * tau * abs(energy_t) + 2 * radius * energy + load
     residual += pressure * (1 + 2 * radius) * edge.gap * tau
     force = (1 + radius) * abs(energy_t) + pressure * (1 + radius + radius**2)
-    return residual, force, edge.gap * abs(t) + edge.drop
+    # The rounding of r / r_b, of which h has the derivative `slope`, is all that matters near the equator.
+    return residual, force, edge.gap * abs(t) + edge.drop + edge.slope * radius
 
 
 def pressure_terms(cone: Cone, edge: Edge, t: float) -> float:

@@ -145,6 +145,23 @@ class March:
             low, high = (low, middle) if np.isnan(self.held(self.start + middle, self.r_i)) else (middle, high)
         return self.start + high
 
+    def heights(self, radii: Array, ceiling: float) -> Array:
+        """Return for each radius z in equilibrium by bisection, from the tangent cone (held) up to ``ceiling``."""
+        scene = self.energy.parameters
+        r_b, R_0 = scene.substrate.radius, scene.gripper.radius
+        drop = self.energy.height(radii)
+        low = -drop - (R_0 - radii) * (0.0 if np.isinf(r_b) else radii / np.sqrt(r_b**2 - radii**2))
+        high = np.full_like(radii, ceiling + 1e-6 * self.r_i)
+        closed = scene.gas.anchor is not GasAnchor.VENTED
+        for _ in range(70):
+            middle = (low + high) / 2
+            growth = np.pi / 3 * (middle + drop) * (R_0**2 + R_0 * radii + radii**2)
+            volume = scene.gripper.chamber_volume + growth - np.pi * drop / 6 * (3 * radii**2 + drop**2)
+            held = (self.slope(radii, middle) < 0) | (closed & (volume <= 0))
+            low, high = np.where(held, middle, low), np.where(held, high, middle)
+        result: Array = (low + high) / 2
+        return result
+
     def path(self) -> tuple[Array, Array]:
         """Return z and r from the last moment the contact is held at r_i, jumps included."""
         heights = np.linspace(self.start, self.ceiling(), HEIGHTS)
@@ -170,20 +187,26 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, digits: int =
     """
     march = March(parameters, contact_stretch)
     z, r = march.path()
-    with mpmath.workdps(digits + 10):
-        return _Polish(parameters, contact_stretch, march, z, r).reference(digits)
+    # The printed energy excludes r = R_0: stay short of it by less than the digits asked for, with as many to spare.
+    at_rim = march.r_i == parameters.gripper.radius
+    with mpmath.workdps(5 * digits if at_rim else digits + 10):
+        return _Polish(parameters, contact_stretch, march, z, r, digits).reference()
 
 
 class _Polish:
-    def __init__(self, parameters: Parameters, contact_stretch: bool, march: March, z: Array, r: Array) -> None:
-        self.march, self.z, self.r = march, z, r
+    def __init__(
+        self, parameters: Parameters, contact_stretch: bool, march: March, z: Array, r: Array, digits: int
+    ) -> None:
+        self.digits, self.march, self.z, self.r = digits, march, z, r
         self.energy = Energy(parameters, contact_stretch, mpmath, mpmath.mpf)
         self.z_0, self.r_i = start(parameters, mpmath.mpf, mpmath.sqrt)
+        if self.r_i == mpmath.mpf(parameters.gripper.radius):
+            self.r_i *= 1 - mpmath.mpf(10) ** -(digits + 6)
 
     def derivative(self, r: Any, z: Any, of_r: int, of_z: int) -> Any:
         return mpmath.diff(self.energy, (r, z), (of_r, of_z))
 
-    def reference(self, digits: int) -> Reference:
+    def reference(self) -> Reference:
         onset = self.onset()
         jumps, detachment = self.detachment(onset)
         zero = self.zero(onset)
@@ -196,7 +219,7 @@ class _Polish:
             detachment_position=detachment[1],
             detachment_radius=detachment[0],
             jumps=jumps,
-            digits=digits,
+            digits=self.digits,
         )
 
     def force(self, r: Any, z: Any) -> Any:
@@ -205,20 +228,34 @@ class _Polish:
     def onset(self) -> Any:
         """Return the largest z at which the contact is held at r_i."""
         above = self.z[0] + (self.z[1] - self.z[0] if self.z.size > 1 else 1e-3 * abs(self.z[0]) + 1e-9)
-        return self.root(lambda z: self.derivative(self.r_i, z, 1, 0), self.z[0], above)
+        return self.root(lambda z: self.derivative(self.r_i, z, 1, 0), self.onset_below(), above)
 
-    def root(self, function: Callable[[Any], Any], low: float, high: float) -> Any:
+    def onset_below(self) -> Any:
+        held = mpmath.mpf(float(self.z[0]))
+        return held if self.derivative(self.r_i, held, 1, 0) < 0 else self.z_0
+
+    def root(self, function: Callable[[Any], Any], low: Any, high: Any, halvings: int = 0) -> Any:
+        """Bisect until Newton-like steps are safe, then take secant steps."""
         low, high = mpmath.mpf(low), mpmath.mpf(high)
-        if function(low) == 0:
-            return low
-        return mpmath.findroot(function, (low, high), solver="anderson", tol=mpmath.mpf(10) ** (-2 * mpmath.mp.dps + 24), verify=False)
+        rising = function(high) > 0
+        if not (function(low) > 0) != rising:
+            raise NotConverged(f"reference: no change of sign between z = {float(low):g} m and {float(high):g} m")
+        for _ in range(halvings or 40 + 4 * max(mpmath.mp.dps - self.digits - 10, 0)):
+            middle = (low + high) / 2
+            if (function(middle) > 0) == rising:
+                high = middle
+            else:
+                low = middle
+        return mpmath.findroot(function, (low, high), solver="secant", tol=0, maxsteps=12, verify=False)
 
     def detachment(self, onset: Any) -> tuple[int, tuple[Any, Any]]:
         """Return the number of jumps and (r, z) of the last stable contact."""
         steps = -np.diff(self.r)
         jumps = 0
         if self.z.size > 2:
-            jumps = int(np.sum((steps[1:-1] > 8 * np.maximum(steps[:-2], steps[2:])) & (steps[1:-1] > 0.02 * self.march.r_i)))
+            jumps = int(
+                np.sum((steps[1:-1] > 8 * np.maximum(steps[:-2], steps[2:])) & (steps[1:-1] > 0.02 * self.march.r_i))
+            )
         low, widest = float(self.z[-1]), float(self.r[-1])
         high = low + (self.z[-1] - self.z[-2] if self.z.size > 1 else 1e-3 * abs(low) + 1e-9)
         for _ in range(40):
@@ -232,10 +269,8 @@ class _Polish:
 
     def fold(self, radius: float, height: float, onset: Any) -> tuple[Any, Any]:
         if radius <= self.march.radii[0] * 1.001:
-            zero = mpmath.mpf(self.march.r_i) * mpmath.mpf(10) ** (-mpmath.mp.dps)
-            z = mpmath.findroot(lambda z: self.derivative(zero, z, 0, 1), mpmath.mpf(height))
-            return mpmath.mpf(0), z
-        if self.derivative(self.r_i, onset, 2, 0) < 0 and radius >= self.march.radii[-3]:
+            return mpmath.mpf(0), self.apex(mpmath.mpf(self.march.r_i) * mpmath.mpf(10) ** -self.digits, height)
+        if radius >= self.march.radii[-3] and self.derivative(self.r_i, onset, 2, 0) < 0:
             return self.r_i, onset
 
         def system(r: Any, z: Any) -> tuple[Any, Any]:
@@ -243,6 +278,12 @@ class _Polish:
 
         r, z = self.newton(system, radius, height)
         return r, z
+
+    def apex(self, radius: Any, height: float) -> Any:
+        """Return z at which an inflated cone lets go of the apex without force; 0 without inflation."""
+        if not self.force(radius, mpmath.mpf(0)) > 0:
+            return mpmath.mpf(0)
+        return self.root(lambda z: self.force(radius, z), 0.5 * height, 2 * height)
 
     def newton(self, system: Callable[[Any, Any], tuple[Any, Any]], r: float, z: float) -> tuple[Any, Any]:
         """Newton's method in two unknowns with a differenced Jacobian."""
@@ -262,41 +303,41 @@ class _Polish:
 
     def zero(self, onset: Any) -> Any:
         """Return z where the force first turns tensile."""
-        if self.force_at_start() < 0:
+        if self.force(self.r_i, self.z_0) <= 0:
             return self.z_0
         if self.force(self.r_i, onset) < 0:
-            return self.root(lambda z: self.force(self.r_i, z), float(self.z_0), float(onset))
+            return self.root(lambda z: self.force(self.r_i, z), self.z_0, onset)
         tensile = np.flatnonzero(self.march.force(self.r, self.z) < 0)
         if not tensile.size:
             raise NotConverged("reference: the force never becomes tensile")
-        k = tensile[0]
-        return self.newton(
-            lambda r, z: (self.derivative(r, z, 1, 0), self.derivative(r, z, 0, 1)), float(self.r[k]), float(self.z[k])
-        )[1]
+        k = int(tensile[0])
+        low, high = (self.z[k - 1], self.z[k]) if k else (onset, self.z[0])
+        height = high - low + 1e-3 * self.march.r_i
 
-    def force_at_start(self) -> Any:
-        if self.r_i == mpmath.mpf(self.march.energy.parameters.gripper.radius):
-            return mpmath.mpf(0)
-        return self.force(self.r_i, self.z_0)
+        def forceless(r: Any) -> Any:
+            return self.root(lambda z: self.force(r, z), low - height, high + height, 24)
+
+        r = self.root(lambda r: self.derivative(r, forceless(r), 1, 0), self.r[k], self.r[k - 1] if k else self.r_i, 24)
+        return forceless(r)
 
     def peak(self, onset: Any, detachment: tuple[Any, Any]) -> tuple[Any, Any]:
         """Return the most tensile force and its z."""
         candidates = [(self.force(self.r_i, onset), onset)]
-        if detachment[0] != self.r_i:
-            if detachment[0] > 0:
-                candidates.append((self.force(*detachment), detachment[1]))
-            forces = self.march.force(self.r, self.z)
-            k = int(np.argmin(forces))
+        if detachment[0] == self.r_i:
+            return candidates[0]
+        apex = mpmath.mpf(self.march.r_i) * mpmath.mpf(10) ** (-self.digits)
+        candidates.append((self.force(max(detachment[0], apex), detachment[1]), detachment[1]))
 
-            def system(r: Any, z: Any) -> tuple[Any, Any]:
-                rr, zz, rz = self.derivative(r, z, 2, 0), self.derivative(r, z, 0, 2), self.derivative(r, z, 1, 1)
-                return self.derivative(r, z, 1, 0), rr * zz - rz**2
+        def system(r: Any, z: Any) -> tuple[Any, Any]:
+            rr, zz, rz = self.derivative(r, z, 2, 0), self.derivative(r, z, 0, 2), self.derivative(r, z, 1, 1)
+            return self.derivative(r, z, 1, 0), rr * zz - rz**2
 
-            if 0 < k < self.z.size - 1:
-                try:
-                    r, z = self.newton(system, float(self.r[k]), float(self.z[k]))
-                except NotConverged:
-                    r = mpmath.mpf(-1)
-                if 0 < r < self.r_i and onset < z <= detachment[1]:
-                    candidates.append((self.force(r, z), z))
+        radii = float(detachment[0]) + (self.march.r_i - float(detachment[0])) * np.linspace(0, 1, 802)[1:-1] ** 2
+        heights = self.march.heights(radii, float(detachment[1]))
+        k = int(np.nanargmin(self.march.force(radii, heights)))
+        if 0 < k < radii.size - 1:
+            r, z = self.newton(system, float(radii[k]), float(heights[k]))
+            if not (detachment[0] < r < self.r_i and onset < z <= detachment[1]):
+                raise NotConverged(f"reference: the peak force bracketed at r = {radii[k]:g} m was not confirmed")
+            candidates.append((self.force(r, z), z))
         return min(candidates, key=lambda pair: pair[0])
