@@ -193,8 +193,8 @@ def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter) ->
         begins_pinned = peel[0].coordinate[0] == scaled.width
         pinned = pinned_panels(scaled.annulus, peel[0], scaled.start, resolution, counter) if begins_pinned else []
         pieces = path(peel, pinned, scaled.start)
-        read = features(pieces)
-        errors = _errors(scaled.annulus, read, counter)
+        read = features(pieces, scaled.start)
+        errors = _errors(scaled, read, counter)
         before, relative = relative, _relative(read, errors)
         found = Found(pieces, read, errors)
         if relative <= tolerance or relative > 0.5 * before:
@@ -204,21 +204,27 @@ def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter) ->
     return found
 
 
-def _errors(annulus: Annulus, read: Features, counter: Counter) -> Errors:
+def _errors(scaled: Scene, read: Features, counter: Counter) -> Errors:
     """Estimate errors from the change with the order and from the last terms of the series."""
+    annulus = scaled.annulus
     _, force = _change(annulus, read.peak, counter)
     detachment, _ = _change(annulus, read.detachment, counter)
     force += read.peak.piece.panel.tail * abs(read.peak.pull)
     detachment += read.detachment.piece.panel.tail * abs(read.detachment.height - read.start.height)
-    zero = 0.0
-    if read.zero is not None:
-        panel = read.zero.piece.panel
-        slope = panel.pull.deriv()(read.zero.coordinate)
-        lift = panel.height.deriv()(read.zero.coordinate)
-        height, pull = _change(annulus, read.zero, counter)
-        pull += panel.tail * abs(read.peak.pull)
-        zero = height + pull * abs(lift / slope) if slope else 0.0
-    return Errors(force, zero, detachment)
+    return Errors(force, _zero_error(scaled, read, counter), detachment)
+
+
+def _zero_error(scaled: Scene, read: Features, counter: Counter) -> float:
+    """Return the error of the height at which the force vanishes: its own over the slope of the force."""
+    drawn_up = scaled.annulus.surface.curvature == 0 and scaled.annulus.gas.pressure <= 0
+    if read.zero is None:
+        return 0.0 if drawn_up else read.gap  # on a flat, suction pulls from z = 0 on
+    panel = read.zero.piece.panel
+    slope = float(panel.pull.deriv()(read.zero.coordinate))
+    lift = float(panel.height.deriv()(read.zero.coordinate))
+    height, pull = _change(scaled.annulus, read.zero, counter)
+    pull += panel.tail * abs(read.peak.pull)
+    return read.gap + height + (pull * abs(lift / slope) if slope else 0.0)
 
 
 def _change(annulus: Annulus, place: Place, counter: Counter) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 
 from model.errors import NotConverged
-from model.membrane_branch import Counter, Line, pinned_line
+from model.membrane_branch import Counter, Line, pinned_line, pinned_state
 from model.membrane_equilibrium import Annulus, Closure, node_positions, resample, shape, solve
 
 Array = NDArray[np.float64]
@@ -73,9 +73,13 @@ class Place(NamedTuple):
 
 
 class Features(NamedTuple):
-    """What is read off a path; ``zero`` is ``None`` where the force is tensile from the start."""
+    """What is read off a path.
+
+    ``zero`` is ``None`` where the force is tensile from the start; ``gap`` is the height that was not solved below it.
+    """
 
     zero: Place | None
+    gap: float
     start: Place
     onset: Place
     peak: Place
@@ -100,15 +104,30 @@ def peel_panels(annulus: Annulus, branch: Line, floor: float, resolution: Resolu
 
 
 def pinned_panels(annulus: Annulus, peel: Panel, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
-    """Return the states at the widest contact from ``floor`` up to where it peels; none if it peels at once."""
+    """Return the states at the widest contact from ``floor`` up to where it peels; none if it peels at once.
+
+    Where the membrane goes slack on the way, its states are followed from both ends and a gap stays between.
+    """
     width, top = float(peel.coordinate[0]), float(peel.height(peel.coordinate[0]))
     if top - floor <= 1e-12 * (1 + abs(floor)):
         return []
-    line = pinned_line(annulus, width, peel.state[:1], top, floor, counter)
-    if line.coordinate.size == 1:
-        return []
-    ends = float(line.coordinate[0]), float(line.coordinate[-1])
-    return _panels(annulus, line, ends, width, resolution, counter, DEEPEST // 2)
+    upper = pinned_line(annulus, width, peel.state[:1], top, floor, counter)
+    lines = [upper]
+    reached = float(upper.coordinate[0])
+    if reached > floor:
+        bottom = pinned_state(annulus, width, floor, counter).state
+        if bottom is not None:
+            lines = [pinned_line(annulus, width, bottom, floor, reached, counter), upper]
+    return [
+        panel
+        for line in lines
+        if line.coordinate.size > 1
+        for panel in _panels(annulus, line, _ends(line), width, resolution, counter, DEEPEST // 3)
+    ]
+
+
+def _ends(line: Line) -> tuple[float, float]:
+    return float(line.coordinate[0]), float(line.coordinate[-1])
 
 
 def _panels(
@@ -120,7 +139,7 @@ def _panels(
     counter: Counter,
     depth: int,
 ) -> list[Panel]:
-    """Cover a line with panels whose series end."""
+    """Cover a line with panels whose series end; a pinned line may keep gaps where it is slack."""
     panel = None
     for size in PANEL_SIZES:
         finer = _panel(annulus, line, ends, width, resolution.order, size, counter)
@@ -131,9 +150,9 @@ def _panels(
         if panel.tail < resolution.tail:
             return [panel]
     if depth == 0:
-        if panel is None:
+        if panel is None and width is None:
             raise NotConverged("membrane: the branch was found but its refinement did not converge")
-        return [panel]
+        return [] if panel is None else [panel]
     middle = (ends[0] + ends[1]) / 2
     return [
         half
@@ -207,22 +226,31 @@ def path(peel: list[Panel], pinned: list[Panel], floor: float) -> list[Piece]:
     return pieces
 
 
-def features(pieces: list[Piece]) -> Features:
-    """Read zero of force, onset of peeling, greatest pull, detachment and adhesion energy off a path."""
+def features(pieces: list[Piece], floor: float) -> Features:
+    """Read zero of force, onset of peeling, greatest pull, detachment and adhesion energy off a path from ``floor``."""
     start = Place(pieces[0], pieces[0].begin)
     zero = None if start.pull >= 0 else _first_zero(pieces)
     peel = next((piece for piece in pieces if not piece.panel.pinned), pieces[-1])
     candidates = [Place(piece, x) for piece in pieces for x in _pull_extremes(piece)]
-    peak = max(candidates, key=lambda place: place.pull)
     begin = start if zero is None else zero
     return Features(
         zero=zero,
+        gap=_unsolved_below(begin, pieces, floor),
         start=start,
         onset=Place(peel, peel.begin),
-        peak=peak,
+        peak=max(candidates, key=lambda place: place.pull),
         detachment=Place(pieces[-1], pieces[-1].end),
         energy=_energy(pieces, begin),
     )
+
+
+def _unsolved_below(place: Place, pieces: list[Piece], floor: float) -> float:
+    """Return the height between a place at the beginning of a pinned piece and what was solved below it."""
+    if not place.piece.panel.pinned or place.coordinate != place.piece.begin:
+        return 0.0
+    index = next(i for i, piece in enumerate(pieces) if piece is place.piece)
+    below = floor if index == 0 else pieces[index - 1].end
+    return place.coordinate - below
 
 
 def _first_zero(pieces: list[Piece]) -> Place | None:
