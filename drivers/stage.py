@@ -118,6 +118,7 @@ class PIStage:
         self._stop_pressed = threading.Event()
         self._halting = False
         self._out_of_step = False
+        self._landmarks = 0
         self._identity_line = ""
         self._fault = NO_ERROR
         self._servo_expected = False
@@ -449,15 +450,22 @@ class PIStage:
     def _fall_into_step(self) -> None:
         """After a missing or garbled reply, discard every late one.
 
-        The controller answers in order, and its identity can be mistaken for nothing else: whatever comes before it
-        is stale.
+        The controller answers in order, and its identity can be mistaken for nothing else: whatever comes before the
+        last identity asked for is stale. One that has been lost is not waited for longer than for any reply.
         """
         if not self._gateway.connected:
             raise ConnectionError("the port was closed")
         if not self._out_of_step:
             return
         self._gateway.send("*IDN?\n")
+        self._landmarks += 1
         received = ""
-        while not (self._identity_line in received and received.endswith("\n")):
-            received += self._gateway.read()
+        while not (received.count(self._identity_line) >= self._landmarks and received.endswith("\n")):
+            try:
+                received += self._gateway.read()
+            except TimeoutError:
+                if self._identity_line not in received:
+                    raise
+                break
+        self._landmarks = 0
         self._out_of_step = False
