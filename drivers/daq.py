@@ -202,6 +202,7 @@ class NIDaq:
         self._calls = _Calls()
         self._partial = np.empty((len(self._channels), 0))
         self._running = False
+        self._contiguous = True
         self._resources = ExitStack()
         self._closed = False
         try:
@@ -248,20 +249,21 @@ class NIDaq:
         self._check_open()
         with _translated():
             self._task.start()
-        self._running = True
+        self._running = self._contiguous = True
         self._partial = self._partial[:, :0]
 
     def read(self, samples: int) -> Volts:
         """Block until ``samples`` are there; return a fresh C-contiguous array (channels, samples).
 
-        After ``NoReply`` the stream is still contiguous: samples that did come are kept for the next read.
+        Samples that came before a time-out are kept for the next read; after any other failure the stream has a gap,
+        and reading goes on only after ``stop`` and ``start``.
 
         Raises
         ------
         NoReply
             The samples did not come in time; the message tells how many did.
         DataLost
-            The device's or the host's buffer overflowed; stop and start again.
+            The device's or the host's buffer overflowed, or an earlier read failed; stop and start again.
         NotConnected
             The device, the server or the runtime is gone.
         BadReply
@@ -270,6 +272,8 @@ class NIDaq:
         self._check_open()
         if not self._running:
             raise CommandRefused("daq", "the sample clock is not running.", "start the DAQ first.")
+        if not self._contiguous:
+            raise DataLost("daq", "an earlier read failed, and its samples with it.", "stop and start the DAQ again.")
         data = np.full((len(self._channels), samples), np.nan)
         kept = min(self._partial.shape[1], samples)
         if not kept:
@@ -346,10 +350,12 @@ class NIDaq:
         samples = data.shape[1]
         timeout = samples / self._rate + self._patience
         self._calls.deadline = timeout + _SLOWEST_ANSWER
+        self._contiguous = False
         with _translated():
             count = self._read_or_keep(data, timeout)
         if count != samples or not np.isfinite(data).all():
             raise BadReply("daq", f"asked for {samples} samples per channel, {count} came, not all of them numbers.")
+        self._contiguous = True
 
     def _read_or_keep(self, data: Volts, timeout: float) -> int:
         from nidaqmx.errors import DaqReadError
@@ -364,6 +370,7 @@ class NIDaq:
             if not np.isfinite(came).all():
                 raise BadReply("daq", f"the device says {count} samples came, but some are not numbers.") from error
             self._partial = np.concatenate((self._partial, came), axis=1)
+            self._contiguous = True
             raise NoReply(
                 "daq",
                 f"{count} of {data.shape[1]} samples came within {timeout:.2f} s.",
@@ -402,12 +409,12 @@ class _Bounded:
 
 
 def _target(connection: str, allow_remote: bool) -> str:
-    parts = urlsplit(connection)
     try:
-        host, port = parts.hostname, parts.port
+        parts = urlsplit(connection)
+        scheme, host, port = parts.scheme, parts.hostname, parts.port
     except ValueError:
-        host, port = None, None
-    if parts.scheme != "grpc" or not host or not port:
+        scheme, host, port = "", None, None
+    if scheme != "grpc" or not host or not port:
         raise NotConnected("daq", f"connection {connection!r} is not understood.", 'use "local" or "grpc://host:port".')
     if not allow_remote and not _is_loopback(host):
         raise NotConnected(

@@ -476,7 +476,9 @@ class _Service:
         with self._reading:
             if self._world.faults.active("daq", "hang") is not None:
                 self._pace.rest(running, max(timeout, 0.0))
-                self.stopping.wait(context.time_remaining() or _LONGEST_READ)
+                while context.is_active() and not self.stopping.wait(0.01):
+                    pass
+                context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "The server has been told to hang.")
             return running.read(samples, min(timeout, _LONGEST_READ))
 
 
