@@ -11,12 +11,12 @@ is adding one function:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from analysis.errors import FeatureMissing
-from analysis.numerics import Array, ForceJump, LocalFit, Noise
+from analysis.numerics import Array, ForceJump, LocalFit, Noise, block_means
 from analysis.run import Run
 
 Details = Mapping[str, object]
@@ -74,6 +74,42 @@ class Extraction:
     def at(self, signal: Array, index: float) -> float:
         """Return a signal between two samples."""
         return float(np.interp(index, np.arange(signal.size), signal)) if index % 1 else float(signal[int(index)])
+
+    def thinned(self, run: Run, length: int) -> Extraction:
+        """Return the state for a run averaged over ``length`` samples: signals, places, decisions."""
+        windows = self.windows
+        light = Extraction(run, dict(self.values), missing=dict(self.missing), failed=dict(self.failed))
+        light.methods = self.methods
+        light.windows = Windows(
+            free=(windows.free[0] // length, windows.free[1] // length),
+            approach=_thin(windows.approach, length),
+            dwell=_thin(windows.dwell, length),
+            pressurize=_thin(windows.pressurize, length),
+            retraction=_thin(windows.retraction, length),
+            end=windows.end // length,
+        )
+        light.details = {
+            name: {
+                key: value / length if key == "index" and isinstance(value, int | float) else value
+                for key, value in details.items()
+                if key in ("decision", "index", "methods")
+            }
+            for name, details in self.details.items()
+        }
+        light.force, light.separation = block_means(self.force, length), block_means(self.separation, length)
+        light.noise, light.baseline = replace(self.noise, residual=np.empty(0)), self.baseline
+        light.contact_start = self.contact_start // length
+        for name in ("zero", "release", "peak"):
+            if hasattr(self, name):
+                setattr(light, name, getattr(self, name) / length)
+        for name in ("zero_separation", "release_separation"):
+            if hasattr(self, name):
+                setattr(light, name, getattr(self, name))
+        return light
+
+
+def _thin(window: tuple[int, int] | None, length: int) -> tuple[int, int] | None:
+    return None if window is None else (window[0] // length, window[1] // length)
 
 
 @dataclass(frozen=True)

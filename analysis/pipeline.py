@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analysis import chamber, indentation, loading, preparation, retraction  # noqa: F401  (importing registers the steps)
 from analysis.extraction import Extraction, extract, meanings, ordered, unit_of
-from analysis.numerics import Array
+from analysis.numerics import Array, block_means
 from analysis.propagation import budget
 from analysis.quantity import Features, Quantity
 from analysis.run import Run
@@ -80,6 +80,27 @@ class Analysis:
             for step in ordered()
             if step.name in self.work.details or step.name in self.work.failed
         }
+
+
+def lighten(analysis: Analysis, points: int = 10_000) -> Analysis:
+    """Return the analysis with its signals averaged to about ``points`` samples: what pooled figures need, 1 MB a run.
+
+    Features stay as they are. Sample indices and the rate follow the averaging; of the details only decisions and
+    places stay.
+    """
+    run, work = analysis.run, analysis.work
+    length = max(1, run.force.size // points)
+    light_run = replace(
+        run,
+        rate=run.rate / length,
+        force=block_means(run.force, length),
+        height=block_means(run.height, length),
+        pressure=None if run.pressure is None else block_means(run.pressure, length),
+        pump_volume=None if run.pump_volume is None else block_means(run.pump_volume, length),
+        steps=tuple(replace(step, start=step.start // length, stop=step.stop // length) for step in run.steps),
+    )
+    light = work.thinned(light_run, length)
+    return Analysis(light_run, analysis.features, _curve(light), light.force, light)
 
 
 def analyze(run: Run, *, uncertainties: bool = True) -> Analysis:

@@ -35,20 +35,21 @@ def overview(run: Run, analysis: Analysis, prediction: Prediction | None, path: 
         Where to write.
     """
     with canvas(7.2, 7.4) as figure:
-        _draw(figure, run, analysis, prediction)
+        draw_overview(figure, run, analysis, prediction)
         save(figure, path)
 
 
 def overview_bytes(run: Run, analysis: Analysis, prediction: Prediction | None, kind: str = "png") -> bytes:
     """Return the same picture as bytes."""
     with canvas(7.2, 7.4) as figure:
-        _draw(figure, run, analysis, prediction)
+        draw_overview(figure, run, analysis, prediction)
         return encode(figure, kind)
 
 
-def _draw(figure: Figure, run: Run, analysis: Analysis, prediction: Prediction | None) -> None:
+def draw_overview(figure: Figure, run: Run, analysis: Analysis, prediction: Prediction | None) -> None:
+    """Draw both panels into a figure."""
     above, below = figure.subplots(2, 1, height_ratios=[1, 1.25])
-    _against_time(above, run, analysis)
+    draw_against_time(above, run, analysis)
     if analysis.curve is None:
         below.set_axis_off()
         reason = next(iter(analysis.features.missing.values()), "no retraction")
@@ -75,7 +76,8 @@ def _smooth(values: Array, rate: float) -> Array:
     return running_mean(values, max(1, round(0.02 * rate)))
 
 
-def _against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
+def draw_against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
+    """Draw force and pressure of a whole run against time, with the six moments of EML Fig. 2."""
     axes.set_title(run.name, loc="left")
     axes.plot(*thin(run.time, analysis.force), color=BLUE, linewidth=1.0)
     _force_axis(axes)

@@ -1,0 +1,369 @@
+"""The papers' experimental figures: EML 2a, 2b, 3a to 3e, 5a to 5c, SI S9. Without recordings: the models alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.errors import AnalysisError
+from analysis.figures.parts import (
+    Series,
+    draw_band,
+    draw_model,
+    frame_profile,
+    kilopascal,
+    profile_axes,
+    scene,
+    shades,
+)
+from analysis.figures.registry import Material, paper_figure
+from analysis.figures.run_overview import draw_against_time
+from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, MARKERS, ORANGE, PURPLE
+from analysis.indentation import fit_contact, indenter_radius
+from analysis.numerics import running_mean
+from analysis.pipeline import Analysis
+from analysis.published import TABLE_S1
+from analysis.repeats import Group
+from model import jkr
+from model.parameters import Parameters
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+RETRACT_SPEED = 10e-6
+"""EML 2020 section 2, m/s: turns a predicted profile into one against time."""
+
+
+def _published_scenes(diameter: float | None) -> list[tuple[float, Parameters]]:
+    """Return (P_0, scene) at the highest and lowest pressure of Table S1, and in between."""
+    name = "Flat Glass" if diameter is None else f"d_b {diameter * 1e3:g} mm"
+    column = next(column for column in TABLE_S1 if column.substrate == name)
+    high, low = float(column.highest_pressure) * 1e3, float(column.lowest_pressure) * 1e3
+    pressures = [high, 0.0, low] if high * low < 0 else [high, low]
+    return [(pressure, scene(diameter, pressure)) for pressure in pressures]
+
+
+def _of_substrate(material: Material, diameter: float | None) -> list[Group]:
+    """Return the pull-off groups on one substrate, from the highest pressure to the lowest."""
+    return [
+        members
+        for members in material.pull_offs()
+        if members.condition.flat == (diameter is None)
+        and (diameter is None or abs(members.condition.diameter - diameter) < 1e-6)
+    ]
+
+
+def _parameters(members: Group) -> Parameters:
+    parameters = members.kept[0].run.parameters
+    if parameters is None:
+        raise AnalysisError(f"{members.condition}: the recording holds no parameters to predict with")
+    return parameters
+
+
+def _example(material: Material) -> Group | None:
+    """Return the group closest to the papers' example: 60 mm sphere under the strongest suction."""
+    found = material.pull_offs()
+    if not found:
+        return None
+    return min(found, key=lambda m: (abs(m.condition.diameter - 60e-3) > 1e-6, m.condition.pressure or 0.0))
+
+
+@paper_figure("2a", "EML 2a: force and pressure against time", (6.4, 3.8))
+def figure_2a(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r and P_a of one run against time with the six moments; without a recording, the predicted retraction."""
+    axes, series = figure.subplots(), Series()
+    example = _example(material)
+    if example is not None:
+        analysis = example.kept[0]
+        draw_against_time(axes, analysis.run, analysis)
+        _add_thinned(series, analysis)
+        return series.frame()
+    prediction = material.predict(scene(60e-3, -3.2e3))
+    stable = prediction.stable
+    time = (prediction.position[stable] - prediction.position[stable][0]) / RETRACT_SPEED
+    axes.plot(time, prediction.force[stable], "--", color=BLUE, label=r"$F_r$ model")
+    axes.set_xlabel("Time since the start of the retraction [s]")
+    axes.set_ylabel(r"Reaction force $F_r$ [N]", color=BLUE)
+    twin = axes.twinx()
+    twin.plot(time, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
+    twin.set_ylabel(r"Air pressure $P_a$ [kPa]", color=ORANGE)
+    twin.grid(visible=False)
+    axes.set_title("60 mm sphere, model: retraction at 10 µm/s", loc="left")
+    series.add(
+        "60 mm, -3.2 kPa",
+        f"model {prediction.model}",
+        time_s=time,
+        force_N=prediction.force[stable],
+        pressure_Pa=prediction.pressure[stable],
+    )
+    return series.frame()
+
+
+def _add_thinned(series: Series, analysis: Analysis) -> None:
+    run = analysis.run
+    keep = np.linspace(0, run.force.size - 1, min(4000, run.force.size)).astype(int)
+    width = max(1, run.force.size // 4000)
+    columns = {"time_s": run.time[keep], "force_N": running_mean(analysis.force, width)[keep]}
+    if run.pressure is not None:
+        columns["pressure_Pa"] = running_mean(run.pressure, width)[keep]
+    series.add(run.name, "measured", **columns)
+
+
+@paper_figure("2b", "EML 2b: force and pressure against retraction, repeats as bands", (6.0, 4.0))
+def figure_2b(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw mean and standard deviation of F_r and P_a over the repeats of one condition."""
+    axes, series = figure.subplots(), Series()
+    example = _example(material)
+    twin = axes.twinx()
+    twin.grid(visible=False)
+    twin.set_ylabel(r"Air pressure $P_a$ [kPa]", color=ORANGE)
+    profile_axes(axes)
+    if example is None:
+        prediction = material.predict(scene(60e-3, -3.2e3))
+        draw_model(axes, prediction, BLUE, "60 mm, -3.2 kPa", series)
+        stable = prediction.stable
+        twin.plot(prediction.retraction[stable] * 1e3, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
+        axes.set_title("60 mm sphere, model", loc="left")
+    else:
+        mean = draw_band(axes, example, BLUE, str(example.condition), series)
+        if mean is not None and mean.pressure is not None and mean.pressure_deviation is not None:
+            shown = mean.retraction <= axes.get_xlim()[1] * 1e-3
+            place, gas, spread = (v[shown] for v in (mean.retraction * 1e3, mean.pressure, mean.pressure_deviation))
+            twin.plot(place, gas * 1e-3, color=ORANGE)
+            twin.fill_between(
+                place, (gas - spread) * 1e-3, (gas + spread) * 1e-3, color=ORANGE, alpha=0.25, linewidth=0
+            )
+        axes.set_title(f"{example.condition}; {len(example.kept)} repeats, bands ± 1 standard deviation", loc="left")
+    return series.frame()
+
+
+def _by_pressure(figure: Figure, material: Material, diameter: float) -> pd.DataFrame:
+    axes, series = figure.subplots(), Series()
+    groups = _of_substrate(material, diameter)
+    if groups:
+        for members, color in zip(groups, shades(len(groups)), strict=True):
+            label = "vented" if members.condition.pressure is None else kilopascal(members.condition.pressure)
+            draw_band(axes, members, color, label, series)
+        axes.set_title(f"$d_b$ = {diameter * 1e3:g} mm", loc="left")
+    else:
+        scenes = _published_scenes(diameter)
+        for (pressure, parameters), color in zip(scenes, shades(len(scenes)), strict=True):
+            draw_model(axes, material.predict(parameters), color, kilopascal(pressure), series)
+        axes.set_title(f"$d_b$ = {diameter * 1e3:g} mm, model (no recordings)", loc="left")
+    profile_axes(axes)
+    frame_profile(axes)
+    axes.legend(title="$P_0$")
+    return series.frame()
+
+
+@paper_figure("3a", "EML 3a: profiles by initial pressure, d_b = 15 mm")
+def figure_3a(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r against z_r on the 15 mm sphere for every P_0 recorded."""
+    return _by_pressure(figure, material, 15e-3)
+
+
+@paper_figure("3b", "EML 3b: profiles by initial pressure, d_b = 30 mm")
+def figure_3b(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r against z_r on the 30 mm sphere for every P_0 recorded."""
+    return _by_pressure(figure, material, 30e-3)
+
+
+@paper_figure("3c", "EML 3c: profiles by initial pressure, d_b = 60 mm")
+def figure_3c(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r against z_r on the 60 mm sphere for every P_0 recorded."""
+    return _by_pressure(figure, material, 60e-3)
+
+
+SPHERES = (15e-3, 30e-3, 60e-3)
+
+
+def _at_end(material: Material, diameter: float, *, highest: bool) -> Group | None:
+    found = [m for m in _of_substrate(material, diameter) if m.condition.pressure is not None]
+    if not found:
+        return None
+    return (max if highest else min)(found, key=lambda m: m.condition.pressure or 0.0)
+
+
+def _spheres(figure: Figure, material: Material, *, highest: bool, with_model: bool) -> pd.DataFrame:
+    axes, series = figure.subplots(), Series()
+    for diameter, color in zip(SPHERES, CYCLE, strict=False):
+        members = _at_end(material, diameter, highest=highest)
+        scenes = _published_scenes(diameter)
+        pressure, parameters = scenes[0] if highest else scenes[-1]
+        label = f"{diameter * 1e3:g} mm, {kilopascal(pressure)}"
+        if members is not None:
+            parameters = _parameters(members)
+            label = f"{diameter * 1e3:g} mm, {kilopascal(members.condition.pressure or 0.0)}"
+            draw_band(axes, members, color, label, series)
+        if with_model or members is None:
+            draw_model(axes, material.predict(parameters), color, "" if members else label, series, name=label)
+    profile_axes(axes)
+    frame_profile(axes)
+    axes.legend(title="$d_b$, $P_0$")
+    if not material.pull_offs():
+        axes.set_title("model (no recordings)", loc="left")
+    elif with_model:
+        axes.set_title("solid: experiment, dashed: model", loc="left")
+    return series.frame()
+
+
+@paper_figure("3d", "EML 3d: profiles by sphere diameter at the highest pressures")
+def figure_3d(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r against z_r on 15, 30 and 60 mm spheres at their highest P_0."""
+    return _spheres(figure, material, highest=True, with_model=False)
+
+
+@paper_figure("3e", "EML 3e: membrane and rigid punch on flat glass", (6.0, 3.8))
+def figure_3e(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r against z_r of the membrane (FAM) and of the fibres on a rigid punch (FARP), and the energy of each.
+
+    The papers hold no model of the punch: without a recording of it only the membrane is drawn.
+    """
+    axes, series = figure.subplots(), Series()
+    punches = material.pull_offs("punch")
+    punches += [m for m in material.groups if m.condition.protocol == "punch"]
+    flats = _of_substrate(material, None)
+    if flats:
+        draw_band(axes, flats[0], BLUE, "FAM" + _energy(flats[0]), series)
+    else:
+        draw_model(axes, material.predict(scene(None, 0.0)), BLUE, "FAM, model", series)
+    if punches:
+        draw_band(axes, punches[0], ORANGE, "FARP" + _energy(punches[0]), series)
+    else:
+        axes.set_title("FARP: no recording, and no model in the papers", loc="left")
+    profile_axes(axes)
+    frame_profile(axes)
+    axes.legend()
+    return series.frame()
+
+
+def _energy(members: Group) -> str:
+    pooled = members.pooled("adhesion_energy_J")
+    return "" if pooled is None else f", {pooled.mean * 1e3:.3f} mJ"
+
+
+@paper_figure("5a", "EML 5a: experiment and model at positive pressure")
+def figure_5a(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw measured and predicted profiles at the highest P_0 of each sphere."""
+    return _spheres(figure, material, highest=True, with_model=True)
+
+
+@paper_figure("5b", "EML 5b: experiment and model at negative pressure")
+def figure_5b(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw measured and predicted profiles at the lowest P_0 of each sphere."""
+    return _spheres(figure, material, highest=False, with_model=True)
+
+
+@paper_figure("5c", "EML 5c: pull-off force against initial pressure", (6.0, 4.0))
+def figure_5c(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_p against P_0: measured means with standard deviations, predictions dashed, Table S1 as open symbols."""
+    axes, series = figure.subplots(), Series()
+    substrates: Sequence[float | None] = (*SPHERES, None)
+    for diameter, column, color, marker in zip(substrates, TABLE_S1, CYCLE, MARKERS, strict=False):
+        label = "flat" if diameter is None else f"{diameter * 1e3:g} mm"
+        printed = _printed(axes, column.substrate, color, marker)
+        groups = [m for m in _of_substrate(material, diameter) if m.pooled("pull_off_force_N")]
+        ends = printed
+        if groups:
+            ends = np.concatenate([printed, _measured_points(axes, groups, color, marker, label, series)])
+        low, high = float(ends.min()), float(ends.max())
+        margin = 0.05 * (high - low)
+        pressures = np.linspace(low - margin, high + margin, 15)
+        base = _parameters(groups[0]) if groups else scene(diameter, 0.0)
+        predictions = [material.predict(base.with_changes(initial_pressure=float(p))) for p in pressures]
+        forces = np.array([prediction.pull_off_force for prediction in predictions])
+        axes.plot(pressures * 1e-3, forces, "--", color=color, label=None if groups else label)
+        series.add(label, f"model {material.model}", initial_pressure_Pa=pressures, pull_off_force_N=forces)
+    axes.plot([], [], "o", color=BLACK, markerfacecolor="none", label="published, Table S1")
+    axes.set_xlabel("Initial pressure $P_0$ [kPa]")
+    axes.set_ylabel("Pull-off force $F_p$ [N]")
+    axes.set_ylim(bottom=0)
+    axes.legend(title="$d_b$")
+    return series.frame()
+
+
+def _printed(axes: Axes, substrate: str, color: str, marker: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Draw the two published points; return their pressures, Pa."""
+    column = next(column for column in TABLE_S1 if column.substrate == substrate)
+    pressures = np.array([float(column.highest_pressure), float(column.lowest_pressure)])
+    forces = np.array([float(column.least_force), float(column.largest_force)])
+    axes.plot(pressures, forces, marker, color=color, markerfacecolor="none", markersize=6)
+    return pressures * 1e3
+
+
+def _measured_points(
+    axes: Axes, groups: Sequence[Group], color: str, marker: str, label: str, series: Series
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Draw mean and standard deviation of each group; return their pressures, Pa."""
+    forces = [members.pooled("pull_off_force_N") for members in groups]
+    gases = [members.pooled("initial_pressure_Pa") for members in groups]
+    mean = np.array([force.mean for force in forces if force is not None])
+    spread = np.nan_to_num(np.array([force.deviation for force in forces if force is not None]))
+    pressure = np.array([0.0 if gas is None else gas.mean for gas in gases])
+    axes.errorbar(pressure * 1e-3, mean, yerr=spread, fmt=marker, color=color, markersize=5, capsize=2, label=label)
+    series.add(
+        label,
+        "measured",
+        initial_pressure_Pa=pressure,
+        pull_off_force_N=mean,
+        pull_off_force_standard_deviation_N=spread,
+        count=np.array([float(len(members.kept)) for members in groups]),
+    )
+    return pressure
+
+
+JKR_RADIUS = 4e-3
+JKR_MODULUS = 0.25e6
+"""Contact modulus of the fibrillar layer that gives the papers' contact of 0.5 mm radius at 78 mN, Pa."""
+
+
+@paper_figure("S9", "SI S9: JKR test of the membrane, rigid and soft system", (8.6, 3.8))
+def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
+    """Draw F_r against z of the JKR tests with the fitted JKR, DMT and Maugis curves.
+
+    Without recordings: JKR's curve for the works of adhesion of Tables S3 and S4.
+    """
+    series = Series()
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, gripper, work, letter in zip(panels, ("soft", "rigid"), (3.3, 4.1), "AB", strict=True):
+        found = [m for m in material.groups if m.condition.protocol == "indentation" and m.condition.gripper == gripper]
+        if found:
+            _draw_indentation(axes, found[0].kept[0], series)
+            axes.set_title(f"{letter}  {gripper} system, {found[0].condition.place}", loc="left")
+        else:
+            curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=0.9e-3)
+            axes.plot(curve.indentation * 1e3, curve.force * 1e3, "--", color=BLUE)
+            axes.set_title(f"{letter}  {gripper} system: JKR, $\\omega$ = {work} J/m² (no recordings)", loc="left")
+            series.add(f"{gripper} system", "model JKR", displacement_m=curve.indentation, force_N=curve.force)
+        axes.set_xlabel("Vertical displacement z [mm], compression positive")
+        axes.axhline(0, color=BLACK, linewidth=0.6)
+    panels[0].set_ylabel(r"Reaction force $F_r$ [mN]")
+    return series.frame()
+
+
+def _draw_indentation(axes: Axes, analysis: Analysis, series: Series) -> None:
+    work = analysis.work
+    start, _ = work.retraction()
+    origin = analysis.features.value("contact_height_m")
+    width = max(1, work.force.size // 4000)
+    force, depth = running_mean(work.force, width)[::width], origin - work.separation[::width]
+    axes.plot(depth * 1e3, force * 1e3, color=BLUE, label="measured")
+    series.add(analysis.run.name, "measured", displacement_m=depth, force_N=force)
+    if "detachment" not in work.details:
+        return
+    part = slice(start, int(work.release))
+    fits = fit_contact(work.separation[part], work.force[part], indenter_radius(analysis.run))
+    for fit, color, style in zip(fits, (ORANGE, GREEN, PURPLE), ("--", ":", "-."), strict=True):
+        label = f"{fit.model}: {fit.work_of_adhesion:.2f} J/m²"
+        axes.plot((origin - fit.separation) * 1e3, fit.force * 1e3, style, color=color, label=label)
+        series.add(
+            f"{analysis.run.name} {fit.model}",
+            f"model {fit.model}",
+            displacement_m=origin - fit.separation,
+            force_N=fit.force,
+        )
+    axes.legend()

@@ -1,0 +1,128 @@
+"""Parts that several figures share: axes of a force profile, bands of repeats, dashed model lines, long tables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.figures.style import GREY
+from analysis.numerics import Array
+from analysis.repeats import Band, Group, band
+from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+    from model.prediction import Prediction
+
+PAPER_MEMBRANE = Membrane(youngs_modulus=2.0e6, thickness=200e-6, work_of_adhesion=4.0)
+"""The PDMS-based membrane of EML 2020, section 4."""
+
+
+def scene(
+    diameter: float | None,
+    pressure: float,
+    *,
+    membrane: Membrane = PAPER_MEMBRANE,
+    gripper: Gripper | None = None,
+    flat: bool = False,
+) -> Parameters:
+    """Return the papers' rigid gripper on a sphere, a flat disk, or (``diameter`` None) an unbounded flat; SI units."""
+    return Parameters(
+        substrate=Substrate("flat" if flat or diameter is None else "sphere", diameter),
+        gripper=gripper or Gripper(),
+        membrane=membrane,
+        gas=Gas(initial_pressure=pressure, anchor=GasAnchor.FREE),
+    )
+
+
+class Series:
+    """Collects what a figure draws into one long table."""
+
+    def __init__(self) -> None:
+        self._rows: list[pd.DataFrame] = []
+
+    def add(self, series: str, source: str, **columns: Array) -> None:
+        """Add one line: its name, ``"measured"`` or ``"model ..."``, and its columns with units in their names."""
+        import pandas as pd
+
+        frame = pd.DataFrame(columns)
+        frame.insert(0, "source", source)
+        frame.insert(0, "series", series)
+        self._rows.append(frame)
+
+    def frame(self) -> pd.DataFrame:
+        """Return the long table."""
+        import pandas as pd
+
+        return pd.concat(self._rows, ignore_index=True) if self._rows else pd.DataFrame(columns=["series", "source"])
+
+
+def profile_axes(axes: Axes) -> None:
+    """Label the axes of a force profile."""
+    axes.set_xlabel(r"Retraction $z_r$ [mm]")
+    axes.set_ylabel(r"Reaction force $F_r$ [N]")
+    axes.axhline(0, color=GREY, linewidth=0.7, zorder=1)
+
+
+def draw_band(axes: Axes, members: Group, color: str, label: str, series: Series) -> Band | None:
+    """Draw the mean of a group's curves with its standard deviation shaded, up to a little beyond detachment."""
+    mean = band(members)
+    if mean is None:
+        return None
+    pooled = members.pooled("pull_off_distance_m")
+    last = np.inf if pooled is None else 1.06 * pooled.mean
+    shown = mean.retraction <= last
+    place, force, spread = (values[shown] for values in (mean.retraction, mean.force, mean.force_deviation))
+    axes.plot(place * 1e3, force, color=color, label=label)
+    axes.fill_between(place * 1e3, force - spread, force + spread, color=color, alpha=0.25, linewidth=0)
+    columns = {"retraction_m": place, "force_N": force, "force_standard_deviation_N": spread}
+    if mean.pressure is not None:
+        columns["pressure_Pa"] = mean.pressure[shown]
+    series.add(label, "measured", **columns)
+    return mean
+
+
+def draw_model(
+    axes: Axes, prediction: Prediction, color: str, label: str, series: Series, *, style: str = "--", name: str = ""
+) -> None:
+    """Draw a predicted profile up to detachment and its drop to zero."""
+    stable = prediction.stable
+    if not stable.any():
+        return
+    place, force = prediction.retraction[stable], prediction.force[stable]
+    order = np.argsort(place, kind="stable")
+    place, force = place[order], force[order]
+    axes.plot(np.append(place, place[-1]) * 1e3, np.append(force, 0.0), style, color=color, label=label or None)
+    series.add(
+        name or label,
+        f"model {prediction.model}",
+        retraction_m=place,
+        force_N=force,
+        pressure_Pa=prediction.pressure[stable][order],
+        contact_radius_m=prediction.contact_radius[stable][order],
+    )
+
+
+def shades(count: int, name: str = "viridis") -> list[str]:
+    """Return ``count`` colours that stay in order when printed grey."""
+    import matplotlib as mpl
+    from matplotlib.colors import to_hex
+
+    return [to_hex(mpl.colormaps[name](x)) for x in np.linspace(0.05, 0.88, count)]
+
+
+def kilopascal(pressure: float) -> str:
+    """Write a pressure for a legend."""
+    return f"{pressure / 1e3:+.1f} kPa"
+
+
+def frame_profile(axes: Axes, *, deepest: float | None = None) -> None:
+    """Leave out most of the compression: the papers show the tension."""
+    low, high = axes.get_ylim()
+    depth = low if deepest is None else min(low, -deepest)
+    axes.set_ylim(depth, min(high, 0.45 * abs(depth)))
+    left, right = axes.get_xlim()
+    axes.set_xlim(max(left, -0.25 * right), right)

@@ -1,0 +1,106 @@
+"""Why the analysis decided as it did: one run's tare, contact point, peak and detachment, close up."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, canvas, encode, thin
+from analysis.numerics import LocalFit, running_mean
+from analysis.pipeline import Analysis
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def reasons(analysis: Analysis, kind: str = "png") -> bytes:
+    """Return the picture as bytes; panels whose step failed say why."""
+    with canvas(8.4, 5.6) as figure:
+        draw_reasons(figure, analysis)
+        return encode(figure, kind)
+
+
+def draw_reasons(figure: Figure, analysis: Analysis) -> None:
+    """Draw the four panels."""
+    panels = figure.subplots(2, 2).ravel()
+    drawers = (("tare", _tare), ("contact", _contact), ("pull-off", _peak), ("detachment", _detachment))
+    for axes, (step, drawer) in zip(panels, drawers, strict=True):
+        if step in analysis.work.details:
+            drawer(axes, analysis)
+        else:
+            axes.set_axis_off()
+            words = f"{step}: {analysis.work.failed.get(step, 'does not belong to this protocol')}"
+            axes.text(0.5, 0.5, words, ha="center", va="center", wrap=True, transform=axes.transAxes, fontsize=8)
+
+
+def _tare(axes: Axes, analysis: Analysis) -> None:
+    run, details = analysis.run, analysis.work.details["tare"]
+    baseline = analysis.work.baseline
+    center = float(baseline(0.0))
+    axes.plot(*thin(run.time, (run.force - center) * 1e3), color=GREY, linewidth=0.6)
+    windows = details["windows"]
+    assert isinstance(windows, list)
+    for start, stop in windows:
+        part = slice(start, stop)
+        axes.plot(*thin(run.time[part], (run.force[part] - center) * 1e3, 500), color=BLUE, linewidth=0.8)
+    ends = np.array([0.0, run.force.size - 1.0])
+    axes.plot(ends / run.rate, (baseline(ends) - center) * 1e3, color=ORANGE)
+    noise = 1e3 * analysis.work.noise.sigma
+    drift = 1e3 * abs(float(baseline(ends[1]) - baseline(ends[0])))
+    axes.set_ylim(-8 * noise - drift, 8 * noise + drift)
+    axes.set_title(f"Tare: {details['decision']}", loc="left", fontsize=8.5)
+    axes.set_xlabel("Time [s]")
+    axes.set_ylabel("Force minus tare [mN]")
+
+
+def _contact(axes: Axes, analysis: Analysis) -> None:
+    details = analysis.work.details["contact"]
+    separation, force = np.asarray(details["separation"]), np.asarray(details["force"])
+    origin = analysis.features.value("contact_height_m")
+    shown = force < 0.3 * force.max()
+    axes.plot((separation[shown] - origin) * 1e6, force[shown] * 1e3, ".", color=GREY, markersize=2)
+    methods = details["methods"]
+    assert isinstance(methods, dict)
+    for (name, place), color in zip(methods.items(), CYCLE, strict=False):
+        axes.axvline(
+            (place - origin) * 1e6, color=color, linewidth=1.2, label=f"{name}: {(place - origin) * 1e6:+.1f} µm"
+        )
+    axes.axvline(0, color=BLACK, linestyle=":", linewidth=1.2)
+    axes.set_title(f"Contact: {details['decision']}", loc="left", fontsize=8.5)
+    axes.set_xlabel("Separation from contact [µm]")
+    axes.set_ylabel("Force [mN]")
+    axes.legend(fontsize=7)
+
+
+def _peak(axes: Axes, analysis: Analysis) -> None:
+    work, details = analysis.work, analysis.work.details["pull-off"]
+    fit = details["fit"]
+    assert isinstance(fit, LocalFit)
+    width = fit.stop - fit.start
+    start, stop = max(0, fit.start - width), min(work.force.size, fit.stop + width)
+    time = np.arange(start, stop) / analysis.run.rate
+    axes.plot(*thin(time, work.force[start:stop] * 1e3), color=GREY, linewidth=0.6)
+    inside = np.linspace(fit.start, fit.stop - 1, 200)
+    axes.plot(inside / analysis.run.rate, fit.polynomial(inside) * 1e3, color=ORANGE)
+    axes.plot(work.peak / analysis.run.rate, fit(work.peak) * 1e3, "v", color=BLACK)
+    axes.set_title(f"Pull-off: {details['decision']}", loc="left", fontsize=8.5)
+    axes.set_xlabel("Time [s]")
+    axes.set_ylabel("Force [mN]")
+
+
+def _detachment(axes: Axes, analysis: Analysis) -> None:
+    work, rate = analysis.work, analysis.run.rate
+    duration = analysis.features.value("snap_duration_s")
+    reach = round(max(0.05, 5 * (0.0 if np.isnan(duration) else duration)) * rate)
+    start, stop = max(0, int(work.release) - reach), min(work.force.size, int(work.release) + reach)
+    time = (np.arange(start, stop) - work.release) / rate * 1e3
+    axes.plot(time, work.force[start:stop] * 1e3, ".-", color=BLUE, markersize=3, linewidth=0.6)
+    smooth = running_mean(work.force[start:stop], max(1, round(0.005 * rate)))
+    axes.plot(time, smooth * 1e3, color=GREEN, linewidth=0.8)
+    axes.axvline(0, color=BLACK, linestyle=":")
+    axes.axhline(0, color=GREY, linewidth=0.7)
+    axes.set_title(f"Detachment: {work.details['detachment']['decision']}", loc="left", fontsize=8.5)
+    axes.set_xlabel("Time from detachment [ms]")
+    axes.set_ylabel("Force [mN]")

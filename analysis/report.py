@@ -1,0 +1,279 @@
+"""One self-contained report of any number of runs: HTML with the pictures inside, or PDF. Same input, same bytes."""
+
+from __future__ import annotations
+
+import base64
+import html
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from analysis.batch import Analyzed
+from analysis.figures.registry import Material, picture
+from analysis.pipeline import Analysis
+from analysis.quantity import DISPLAY, Quantity, with_uncertainty
+from analysis.repeats import OUTLIER_RULE, Group, group
+from analysis.tables import Table, all_tables
+from model.prediction import Prediction
+
+if TYPE_CHECKING:
+    from matplotlib.backends.backend_pdf import PdfPages
+    from matplotlib.figure import Figure
+
+PACKAGES = ("numpy", "scipy", "matplotlib", "pandas")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a run came from: file name, SHA-256 of the file, and its own metadata (scene, bench, versions)."""
+
+    name: str
+    sha256: str
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Report:
+    """What a report is made of; ``model`` names the prediction drawn over the curves."""
+
+    runs: Sequence[Analyzed]
+    sources: Sequence[Source] = ()
+    model: str = "cone"
+    title: str = "Pull-off tests"
+
+    def __post_init__(self) -> None:
+        self.groups: list[Group] = group(analyzed.analysis for analyzed in self.runs)
+        self.material = Material(self.groups, self.model)
+
+    def tables(self) -> list[Table]:
+        """Return the papers' tables, the pooled numbers and the outliers."""
+        return [*all_tables(self.groups), pooled_table(self.groups), *outlier_table(self.groups)]
+
+    def figures(self) -> list[str]:
+        """Return the numbers of the papers' figures that these recordings can fill."""
+        chosen = []
+        spheres = {m.condition.diameter for m in self.material.pull_offs() if not m.condition.flat}
+        chosen += [number for number, d in (("3a", 15e-3), ("3b", 30e-3), ("3c", 60e-3)) if d in spheres]
+        if len(self.material.pull_offs()) > 1:
+            chosen += ["5a", "5b", "5c"]
+        if any(m.condition.protocol == "punch" for m in self.groups):
+            chosen.append("3e")
+        if any(m.condition.protocol == "indentation" for m in self.groups):
+            chosen.append("S9")
+        return chosen
+
+
+def pooled_table(groups: Sequence[Group]) -> Table:
+    """Return the main features of every condition: mean ± standard deviation (n)."""
+    features = {
+        "pull_off_force_N": "F_p [N]",
+        "pull_off_distance_m": "D_p [mm]",
+        "retraction_at_pull_off_m": "z_r at F_p [mm]",
+        "initial_pressure_Pa": "P_0 [kPa]",
+        "preload_N": "Preload [N]",
+        "adhesion_energy_J": "Energy [mJ]",
+        "work_of_adhesion_J_m2": "ω_ad [J/m²]",
+        "chamber_volume_m3": "V_0 [mL]",
+        "leak_rate_Pa_s": "Leak [Pa/s]",
+    }
+    used = {name: label for name, label in features.items() if any(m.pooled(name) for m in groups)}
+    rows = tuple((str(m.condition), *(_pooled_cell(m, name) for name in used)) for m in groups)
+    notes = ("Mean ± standard deviation (number of repeats).",)
+    return Table("Repeats by condition", ("Condition", *used.values()), rows, notes)
+
+
+def _pooled_cell(members: Group, name: str) -> str:
+    pooled = members.pooled(name)
+    if pooled is None:
+        return "–"
+    factor = DISPLAY.get(pooled.unit, ("", 1.0))[1]
+    return f"{with_uncertainty(pooled.mean * factor, pooled.deviation * factor)} ({pooled.count})"
+
+
+def outlier_table(groups: Sequence[Group]) -> list[Table]:
+    """Return a table of the runs left out, or the sentence that there are none."""
+    rows = tuple((name, str(m.condition), reason) for m in groups for name, reason in m.outliers.items())
+    shown = rows or (("none", "", ""),)
+    return [Table("Outliers", ("Run", "Condition", "Why"), shown, (f"Rule: {OUTLIER_RULE}",))]
+
+
+def feature_table(analysis: Analysis) -> Table:
+    """Return every feature of one run with its uncertainty, the largest source of it, and what it is."""
+    rows = [
+        (name, str(quantity), _largest_source(quantity), quantity.explanation)
+        for name, quantity in analysis.features.items()
+    ]
+    rows += [(name, "–", "", f"missing: {reason}") for name, reason in analysis.features.missing.items()]
+    return Table("Features", ("Feature", "Value", "Largest source of uncertainty", "What it is"), tuple(rows))
+
+
+def _largest_source(quantity: Quantity) -> str:
+    if not quantity.budget or quantity.uncertainty == 0:
+        return ""
+    source, part = max(quantity.budget.items(), key=lambda item: item[1])
+    return f"{source} ({(part / quantity.uncertainty) ** 2:.0%})"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions the numbers depend on."""
+    found = {"membrane-adhesion-rig": version("membrane-adhesion-rig"), "python": platform.python_version()}
+    return found | {package: version(package) for package in PACKAGES}
+
+
+STYLE = """
+body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;background:#fff;max-width:66rem;margin:2rem auto;padding:0
+1.2rem} h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.2rem;margin-top:2.4rem;border-bottom:1px solid #ccc}
+h3{font-size:1rem;margin:1.6rem 0 .4rem}
+table{border-collapse:collapse;margin:.8rem 0;font-size:.84rem;display:block;overflow-x:auto}
+caption{text-align:left;font-weight:600;padding:.3rem 0}
+th,td{padding:.22rem .6rem;border-bottom:1px solid #e2e2e2;text-align:left;vertical-align:top}
+td{font-variant-numeric:tabular-nums}thead th{border-bottom:2px solid #999;white-space:nowrap}
+tbody th{font-weight:500}.note{font-size:.8rem;color:#555;margin:.1rem 0}
+img{max-width:100%;height:auto}.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(24rem,1fr));gap:1rem}
+code{font-size:.8rem;word-break:break-all}details{margin:.5rem 0}summary{cursor:pointer;color:#0072B2}
+@media print{details{display:block}}
+"""
+
+
+def write_html(report: Report, path: Path) -> None:
+    """Write the report as one HTML page that needs no other file and no network."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(_page(report)), encoding="utf-8", newline="\n")
+
+
+def _page(report: Report) -> Iterator[str]:
+    count = len(report.runs)
+    title = html.escape(report.title)
+    yield f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    yield f"<style>{STYLE}</style></head><body>"
+    complete = sum(analyzed.analysis.run.complete for analyzed in report.runs)
+    yield f"<h1>{title}</h1><p>{count} {_plural('recording', count)}, {complete} complete, "
+    conditions = len(report.groups)
+    yield f"{conditions} {_plural('condition', conditions)}. Uncertainties are one standard deviation.</p>"
+    yield "<h2>Results</h2>"
+    for table in report.tables():
+        yield table.html()
+    figures = report.figures()
+    if figures:
+        yield '<h2>Figures</h2><div class="pair">'
+        for number in figures:
+            yield f"<figure>{_image(picture(number, report.material), f'Figure {number}')}"
+            yield f"<figcaption>Figure {number}</figcaption></figure>"
+        yield "</div>"
+    yield "<h2>Runs</h2>"
+    for analyzed in report.runs:
+        yield from _run(analyzed)
+    yield "<h2>Sources and versions</h2>"
+    yield _sources(report).html()
+    yield Table("Versions", ("Package", "Version"), tuple(versions().items())).html()
+    yield "</body></html>\n"
+
+
+def _plural(word: str, count: int) -> str:
+    return word if count == 1 else word + "s"
+
+
+def _image(data: bytes, words: str) -> str:
+    encoded = base64.b64encode(data).decode("ascii")
+    return f'<img alt="{html.escape(words)}" src="data:image/png;base64,{encoded}">'
+
+
+def _run(analyzed: Analyzed) -> Iterator[str]:
+    analysis, prediction = analyzed.analysis, analyzed.prediction
+    run = analysis.run
+    yield f"<h3>{html.escape(run.name)}</h3>"
+    ended = "" if run.complete else " This run was aborted; what it holds is analysed."
+    yield f'<p class="note">{html.escape(run.protocol)}, {analyzed.samples} samples at {analyzed.rate:g} Hz.{ended}</p>'
+    yield _image(analyzed.overview, f"{run.name}: force and pressure")
+    if prediction is None:
+        yield f'<p class="note">No prediction: {html.escape(analyzed.no_prediction)}.</p>'
+    else:
+        yield _comparison(analysis, prediction).html()
+    yield f"<details><summary>All features</summary>{feature_table(analysis).html()}</details>"
+    yield "<details><summary>Why: the decisions of each step</summary>"
+    yield Table("Decisions", ("Step", "Decision"), tuple(analysis.decisions.items())).html()
+    yield _image(analyzed.reasons, f"{run.name}: decisions") + "</details>"
+
+
+def _comparison(analysis: Analysis, prediction: Prediction) -> Table:
+    """Measured against predicted; the prediction's own numerical error beside it."""
+    pairs = (
+        ("F_p", "pull_off_force_N", prediction.pull_off_force, "pull_off_force"),
+        ("D_p", "pull_off_distance_m", prediction.pull_off_distance, "pull_off_distance"),
+        ("z_r at F_p", "retraction_at_pull_off_m", prediction.retraction_at_pull_off, "retraction_at_pull_off"),
+        ("Adhesion energy", "adhesion_energy_J", prediction.adhesion_energy, "adhesion_energy"),
+    )
+    rows = []
+    for label, name, predicted, key in pairs:
+        if name not in analysis.features:
+            continue
+        measured = analysis.features[name]
+        unit, factor = DISPLAY.get(measured.unit, (measured.unit, 1.0))
+        error = prediction.numerical_error.get(key, prediction.numerical_error.get(name, float("nan")))
+        ratio = f"{(predicted / measured.value - 1):+.1%}" if measured.value else ""
+        rows.append((label, str(measured), f"{predicted * factor:.5g} {unit}", f"{error * factor:.1g} {unit}", ratio))
+    header = ("Quantity", "Measured", f"Model ({prediction.model})", "Numerical error", "Model against measured")
+    return Table("Measured and predicted", header, tuple(rows))
+
+
+def _sources(report: Report) -> Table:
+    keys = list(dict.fromkeys(key for source in report.sources for key in source.metadata))
+    rows = tuple((s.name, s.sha256, *(s.metadata.get(key, "") for key in keys)) for s in report.sources)
+    return Table("Recordings", ("File", "SHA-256", *keys), rows)
+
+
+def write_pdf(report: Report, path: Path) -> None:
+    """Write the report as PDF: tables first, then the figures, then one page per run and one for its decisions."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fixed = {"Creator": None, "Producer": None, "CreationDate": None}
+    with PdfPages(path, metadata=fixed) as pages:
+        _pdf_pages(report, pages)
+
+
+def _pdf_pages(report: Report, pages: PdfPages) -> None:
+    from analysis.figures.registry import find
+    from analysis.figures.style import canvas
+
+    sources = _sources(report)
+    lines = [report.title, "", *(line for table in [*report.tables(), sources] for line in _text_lines(table))]
+    lines += ["", *(f"{name} {number}" for name, number in versions().items())]
+    for first in range(0, len(lines), 70):
+        with canvas(11.7, 8.3) as figure:
+            figure.text(
+                0.03, 0.97, "\n".join(lines[first : first + 70]), va="top", family="DejaVu Sans Mono", fontsize=6
+            )
+            pages.savefig(figure)  # type: ignore[no-untyped-call]
+    for number in report.figures():
+        chosen = find(number)
+        with canvas(*chosen.size) as figure:
+            chosen.draw(figure, report.material)
+            pages.savefig(figure)  # type: ignore[no-untyped-call]
+    for analyzed in report.runs:
+        for data in (analyzed.overview, analyzed.reasons):
+            with canvas(8.3, 8.3) as figure:
+                _place(figure, data)
+                pages.savefig(figure)  # type: ignore[no-untyped-call]
+
+
+def _place(figure: Figure, data: bytes) -> None:
+    """Put a finished picture on a page."""
+    import io
+
+    from matplotlib.image import imread
+
+    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96))
+    axes.set_axis_off()
+    axes.imshow(imread(io.BytesIO(data), format="png"), interpolation="none")
+
+
+def _text_lines(table: Table) -> list[str]:
+    rows = [table.header, *table.rows]
+    widths = [min(44, max(len(row[i]) for row in rows)) for i in range(len(table.header))]
+    lines = ["  ".join(cell[:44].ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    return [table.title, *lines, *table.notes, ""]
