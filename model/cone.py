@@ -14,7 +14,7 @@ import numpy as np
 from model.cone_branch import Branch, Point, largest_slope
 from model.cone_error import of_features
 from model.cone_path import Path, strongest_pull, trace, zero_of_force
-from model.cone_terms import Cone, Driven, Gas, Isothermal, Vented
+from model.cone_terms import Cone, Driven, Gas, Isothermal, Number, Vented
 from model.parameters import GasAnchor, Parameters
 from model.prediction import Array, Jump, Outcome, Prediction
 from model.start import check, start_position, start_radius
@@ -149,10 +149,10 @@ def _gas(parameters: Parameters, scales: Scales, cone: Cone) -> Gas:
     return Isothermal(initial, atmosphere, chamber)
 
 
-def start_growth(cone: Cone) -> float:
+def start_growth(cone: Cone) -> Number:
     """Return V(z_0, r_i) - V_0, regular also where the contact reaches the rim."""
     edge, radius = cone.edge(cone.start_radius), cone.start_radius
-    return float((cone.start_position + edge.drop) * (1 + radius + radius**2) - edge.cap)
+    return (cone.start_position + edge.drop) * (1 + radius + radius**2) - edge.cap
 
 
 class Profile(NamedTuple):

@@ -111,13 +111,13 @@ def _last_crossing(cone: Cone, edge: Edge, gas: Driven, low: Array, high: Array)
     return t[rows, last], t[rows, last + 1]
 
 
-def _tilt(state: State) -> float:
+def tilt_of(state: State) -> float:
     """Return -dt/drho along the branch; zero where nothing but geometry shapes it (no load, no pressure)."""
     return float(state.residual_radius / state.residual_t) if state.residual_t else 0.0
 
 
-def _tilts(state: State) -> Array:
-    """Return ``_tilt`` for arrays."""
+def tilts(state: State) -> Array:
+    """Return ``tilt_of`` for arrays."""
     shaped = state.residual_t != 0
     result: Array = np.where(shaped, state.residual_radius / np.where(shaped, state.residual_t, 1.0), 0.0)
     return result
@@ -144,7 +144,7 @@ class Branch:
         self.t = largest_slope(cone, self.edge)
         state = cone.state(self.edge, self.t)
         self.force = state.force
-        tilt = _tilts(state)
+        tilt = tilts(state)
         self.position = cone.position(self.edge, self.t)
         self.climb = -(self.t + self.edge.slope) - self.edge.gap * tilt
         self.force_climb = state.force_radius - state.force_t * tilt
@@ -156,7 +156,7 @@ class Branch:
         t = self._centre()
         edge = self.cone.edge(0.0)
         state = self.cone.state(edge, t)
-        slope = -_tilt(state) if t > 0 else self._slope_at_apex(state.pressure)
+        slope = -tilt_of(state) if t > 0 else self._slope_at_apex(state.pressure)
         climb = slope - t
         force_climb = state.force_radius + state.force_t * slope if math.isfinite(slope) else -math.inf
         self.radius = np.append(self.radius, 0.0)
@@ -207,7 +207,7 @@ class Branch:
         """Return dz/drho along the branch; negative where it is stable under displacement control."""
         edge, t = self.at(radius)
         state = self.cone.state(edge, t)
-        tilt = _tilt(state)
+        tilt = tilt_of(state)
         self._last = (radius, t, -tilt)
         return float(-(t + edge.slope) - edge.gap * tilt)
 
@@ -217,7 +217,7 @@ class Branch:
             return float(self.force_climb[-1])
         edge, t = self.at(radius)
         state = self.cone.state(edge, t)
-        tilt = _tilt(state)
+        tilt = tilt_of(state)
         self._last = (radius, t, -tilt)
         return float(state.force_radius - state.force_t * tilt)
 
@@ -269,13 +269,24 @@ class Branch:
             return float(self.cone.state(edge, t).force)
 
         width = max(high - low, EPSILON)
-        while force(low) < 0 and low > -edge.slope:
-            low -= width
+        floor = self._floor(edge)
+        low = max(low, floor)
+        while force(low) < 0 and low > floor:
+            low = max(low - width, floor)
             width *= 2
         while force(high) > 0:
             high += width
             width *= 2
         return bracketed(force, low, high, force(low), force(high))
+
+    def _floor(self, edge: Edge) -> float:
+        """Return the lowest meaningful slope: along the sphere's tangent, or where the chamber is all but empty."""
+        gas = self.cone.gas
+        if not isinstance(gas, Isothermal):
+            return float(-edge.slope)
+        level = gas.anchor + gas.offset - edge.cap
+        emptied = -level / (edge.gap * (1 + edge.radius + edge.radius**2)) if edge.gap > 0 else -math.inf
+        return float(max(-edge.slope, emptied + 1e-9 * abs(emptied)))
 
     def where_position_is(self, position: float, before: Point, after: Point) -> Point:
         """Return the point at a height between those of two points of one stretch of the branch."""

@@ -129,9 +129,10 @@ def _pinned_zero(branch: Branch, before: Point, after: Point) -> Point:
 
 def strongest_pull(branch: Branch, path: Path) -> Point:
     """Return where the force is most tensile."""
-    best = min(pinned_points(branch, path), key=lambda point: point.force)
+    held = pinned_points(branch, path)
+    best = min(reversed(held), key=lambda point: point.force)
     for stretch in path.stretches:
-        best = min(best, _strongest_of(branch, stretch), key=lambda point: point.force)
+        best = min(_strongest_of(branch, stretch), best, key=lambda point: point.force)
     return best
 
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
+
+from model.prediction import Array
+
 EPSILON = 2.220446049250313e-16
 
 
@@ -48,3 +52,31 @@ def _fraction(a: float, b: float, c: float, fa: float, fb: float, fc: float) -> 
         step = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
         return step if math.isfinite(step) else 0.5
     return 0.5
+
+
+def bracketed_many(
+    function: Callable[[Array], Array], a: Array, b: Array, fa: Array, fb: Array, tolerance: float = 1e-13
+) -> Array:
+    """Return the roots in many brackets at once (Chandrupatla's method, element by element).
+
+    Brackets of no width return their end; elements whose values do not differ in sign end somewhere inside.
+    """
+    fraction = np.clip(np.where(fa == fb, 0.5, fa / np.where(fa == fb, 1.0, fa - fb)), 0.01, 0.99)
+    best = b
+    for _ in range(60):
+        x = a + fraction * (b - a)
+        fx = function(x)
+        same = (fx > 0) == (fa > 0)
+        c, fc = np.where(same, a, b), np.where(same, fa, fb)
+        b, fb = np.where(same, b, a), np.where(same, fb, fa)
+        a, fa = x, fx
+        best = np.where(np.abs(fa) < np.abs(fb), a, b)
+        width = np.abs(b - a)
+        limit = np.where(width > 0, (tolerance * np.abs(best) + 5e-324) / width, 1.0)
+        if ((limit > 0.5) | (fx == 0)).all():
+            break
+        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+        step = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+        safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi) & np.isfinite(step)
+        fraction = np.clip(np.where(safe, step, 0.5), np.minimum(limit, 0.5), np.maximum(1 - limit, 0.5))
+    return best
