@@ -317,8 +317,10 @@ def _measured_points(
 
 
 JKR_RADIUS = 4e-3
-JKR_MODULUS = 0.25e6
+JKR_MODULUS = 1.9e6
 """Contact modulus of the fibrillar layer that gives the papers' contact of 0.5 mm radius at 78 mN, Pa."""
+JKR_CONTACT = 0.92e-3
+"""Contact radius under the preload of about 100 mN, m."""
 
 
 @paper_figure("S9", "SI S9: JKR test of the membrane, rigid and soft system", (8.6, 3.8))
@@ -335,8 +337,9 @@ def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
             _draw_indentation(axes, found[0].kept[0], series)
             axes.set_title(f"{letter}  {gripper} system, {found[0].condition.place}", loc="left")
         else:
-            curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=0.9e-3)
-            axes.plot(curve.indentation * 1e3, curve.force * 1e3, "--", color=BLUE)
+            curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=JKR_CONTACT)
+            last = curve.indentation[-1] * 1e3
+            axes.plot(np.append(curve.indentation * 1e3, last), np.append(curve.force * 1e3, 0), "--", color=BLUE)
             axes.set_title(f"{letter}  {gripper} system: JKR, $\\omega$ = {work} J/m² (no recordings)", loc="left")
             series.add(f"{gripper} system", "model JKR", displacement_m=curve.indentation, force_N=curve.force)
         axes.set_xlabel("Vertical displacement z [mm], compression positive")

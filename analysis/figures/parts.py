@@ -119,10 +119,11 @@ def kilopascal(pressure: float) -> str:
     return f"{pressure / 1e3:+.1f} kPa"
 
 
-def frame_profile(axes: Axes, *, deepest: float | None = None) -> None:
+def frame_profile(axes: Axes) -> None:
     """Leave out most of the compression: the papers show the tension."""
-    low, high = axes.get_ylim()
-    depth = low if deepest is None else min(low, -deepest)
-    axes.set_ylim(depth, min(high, 0.45 * abs(depth)))
+    drawn = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.get_lines()]
+    depth = -min((float(values.min()) for values in drawn if values.size), default=-1.0)
+    if depth > 0:
+        axes.set_ylim(-1.12 * depth, min(axes.get_ylim()[1], 0.4 * depth))
     left, right = axes.get_xlim()
     axes.set_xlim(max(left, -0.25 * right), right)

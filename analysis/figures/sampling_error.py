@@ -33,7 +33,7 @@ def figure_sampling(figure: Figure, material: Material) -> pd.DataFrame:
     _against_rate(force, data, "pull_off_force_error_N", 1e3, "Error of $F_p$, rms [mN]")
     _against_rate(distance, data, "pull_off_distance_error_m", 1e6, "Error of $D_p$, rms [µm]")
     for (name, rows), color, marker in zip(_by_reader(data), CYCLE, MARKERS, strict=False):
-        cost.loglog(rows["seconds"] * 1e3, rows["pull_off_force_error_N"] * 1e3, marker=marker, color=color, label=name)
+        cost.loglog(rows["seconds"] * 1e3, rows["pull_off_force_error_N"] * 1e3, marker, color=color, label=name)
     cost.set_xlabel("Time per run [ms]")
     cost.set_ylabel("Error of $F_p$, rms [mN]")
     figure.legend(*force.get_legend_handles_labels(), loc="outside upper center", ncols=5)

@@ -91,10 +91,11 @@ def figure_5f(figure: Figure, material: Material) -> pd.DataFrame:
             best = int(np.nanargmax(distances))
             axes.plot(diameters[best] * 1e3, distances[best] * 1e3, marker, color=color)
             words = f"max. at {diameters[best] * 1e3:.0f} mm, {1 - distances[-1] / distances[best]:.0%} less at 60 mm"
+            below = pressure > 0
             axes.annotate(
                 words,
                 (diameters[best] * 1e3, distances[best] * 1e3),
-                xytext=(4, 6),
+                xytext=(4, -14 if below else 6),
                 textcoords="offset points",
                 fontsize=7.5,
             )
@@ -238,11 +239,11 @@ def figure_s8(figure: Figure, material: Material) -> pd.DataFrame:
         prediction = material.predict(scene(None, 0.0, gripper=gripper), "cone-2017")
         draw_model(whole, prediction, color, f"{radius:g} mm", series, style="-")
         if radius == 8.0:
-            draw_model(begin, prediction, color, f"{radius:g} mm", Series(), style="-")
-            start = float(prediction.retraction[prediction.stable].min()) * 1e3
-            begin.set_xlim(start, start + 0.2)
+            first = prediction.stable & (prediction.retraction < prediction.retraction.min() + 20e-6)
+            place, force = prediction.retraction[first], prediction.force[first]
+            begin.plot(place * 1e3, force, ".-", color=color)
     for axes in (whole, begin):
         profile_axes(axes)
-    whole.legend(title="$r_e$")
+    whole.legend(title="$r_e$", loc="upper right", bbox_to_anchor=(0.95, 0.95))
     begin.set_title("beginning, $r_e$ = 8 mm", loc="left")
     return series.frame()
