@@ -106,8 +106,9 @@ class EmulatedDaq:
         self._pace = AtOnce() if speed is None else RealTime(world, speed)
         service = _Service(world, device or usb_6211(), seed, self._pace)
         self._service = service
+        self._workers = futures.ThreadPoolExecutor(16, thread_name_prefix="emulated-daq")
         self._server = grpc.server(
-            futures.ThreadPoolExecutor(16, thread_name_prefix="emulated-daq"),
+            self._workers,
             handlers=[_handlers(service, self.calls)],
             options=[("grpc.so_reuseport", 0), ("grpc.max_receive_message_length", -1)],
         )
@@ -131,11 +132,14 @@ class EmulatedDaq:
         return self
 
     def stop(self) -> None:
-        """Stop serving; a second call does nothing."""
+        """Stop serving; a second call does nothing. Raises what has gone wrong in a real-time plant."""
         self._service.stopping.set()
-        self._server.stop(grace=0.2).wait()
-        if isinstance(self._pace, RealTime):
-            self._pace.stop()
+        try:
+            if isinstance(self._pace, RealTime):
+                self._pace.stop()
+        finally:
+            self._server.stop(grace=0.2).wait()
+            self._workers.shutdown()
 
     def __enter__(self) -> EmulatedDaq:
         return self.start()
