@@ -8,7 +8,7 @@ import numpy as np
 
 from analysis.errors import FeatureMissing
 from analysis.extraction import Details, Extraction, extraction_step
-from analysis.numerics import Array, Noise, block_means, fit_around, running_mean
+from analysis.numerics import Array, Noise, fit_around, on_grid, running_mean
 
 ContactMethod = Callable[[Array, Array, float], int]
 """(depth, force, noise of one point) -> index of contact. Depth rises towards the sample."""
@@ -31,17 +31,18 @@ def contact_method(name: str) -> Callable[[ContactMethod], ContactMethod]:
 def deviation(depth: Array, force: Array, sigma: float) -> int:
     """Deviation from the baseline.
 
-    1. Go back from the deepest point to the last one whose force lies within four standard deviations of zero.
-    2. A line through the next points, up to twice that force, is extended back to zero force.
+    1. The first point from which on five points in a row lie more than four standard deviations off zero.
+    2. A line through the next points, up to three times that force, is extended back to zero force, if it leads back.
     """
-    quiet = np.flatnonzero(np.abs(force) < 4 * sigma)
-    first = int(quiet[-1]) if quiet.size else 0
-    late = np.flatnonzero(np.abs(force[first:]) > 12 * sigma)
-    last = first + int(late[0]) + 2 if late.size else force.size
-    if last - first < 3 or last > force.size:
-        return first
+    off = np.abs(force) > 4 * sigma
+    lasting = np.flatnonzero(np.convolve(off, np.ones(5), mode="valid") == 5)
+    if lasting.size == 0:
+        return force.size - 1
+    first = int(lasting[0])
+    beyond = np.flatnonzero(np.abs(force[first:]) > 12 * sigma)
+    last = min(force.size, first + (int(beyond[0]) if beyond.size else 5) + 2)
     slope, offset = np.polyfit(depth[first:last], force[first:last], 1)
-    if slope == 0:
+    if slope * force[first] <= 0:
         return first
     return int(np.clip(np.searchsorted(depth, -offset / slope), 0, first))
 
@@ -51,14 +52,13 @@ def constant_and_polynomial(depth: Array, force: Array, sigma: float) -> int:
     """Piecewise fit.
 
     1. Use the curve up to the first fifth of its largest force.
-    2. For each candidate, force is zero before and a x + b x^2 with x the depth beyond the candidate; a, b by least
-       squares.
+    2. For each candidate, force is zero before and a + b x + c x^2 with x the depth beyond the candidate, by least
+       squares; a is the snap-in.
     3. The candidate with the smallest sum of squares is the contact.
     """
     del sigma
-    stop = int(np.argmax(np.abs(force) > 0.2 * np.abs(force).max())) or force.size
-    stop = min(force.size, max(stop, 12))
-    depth, force = depth[:stop], force[:stop]
+    stop = min(force.size, max(12, int(np.argmax(force > 0.2 * force.max())) or force.size))
+    depth, force = depth[:stop] - depth[0], force[:stop]
     candidates = np.arange(0, stop - 6)
     for stride in (max(1, candidates.size // 60), 1):
         tried = candidates[::stride]
@@ -69,49 +69,38 @@ def constant_and_polynomial(depth: Array, force: Array, sigma: float) -> int:
 
 
 def _piecewise_error(depth: Array, force: Array, candidate: int) -> float:
-    x = depth[candidate:] - depth[candidate]
+    x = (depth[candidate:] - depth[candidate]) / depth[-1]
     y = force[candidate:]
-    design = np.stack([x, x * x])
-    normal = design @ design.T
-    if abs(np.linalg.det(normal)) < 1e-60:
-        return float(np.sum(force**2))
+    design = np.stack([np.ones_like(x), x, x * x])
+    normal = design @ design.T + 1e-12 * x.size * np.eye(3)
     solution = np.linalg.solve(normal, design @ y)
     return float(np.sum(force[:candidate] ** 2) + np.sum((y - solution @ design) ** 2))
 
 
 @contact_method("gradient")
 def gradient(depth: Array, force: Array, sigma: float) -> int:
-    """Gradient crossing.
+    """Gradient.
 
-    1. The gradient of the force, averaged over one fortieth of the curve.
-    2. Going back from the first tenth of the largest gradient, the point where the gradient falls to what noise alone
-       would give.
+    1. The gradient of the force, as the difference of the means of the next and the last ``n`` points; n grows until
+       noise alone gives less than two per cent of the largest force.
+    2. The first point where it exceeds five times what noise alone gives, less n / 2.
     """
-    width = max(3, force.size // 40)
-    slope = np.gradient(running_mean(force, width), depth)
-    spacing = float(np.median(np.diff(depth)))
-    threshold = max(3 * sigma / (np.sqrt(width) * width * max(spacing, 1e-12)), 0.01 * float(np.abs(slope).max()))
-    steep = int(np.argmax(np.abs(slope) > max(0.1 * np.abs(slope).max(), threshold)))
-    quiet = np.flatnonzero(np.abs(slope[: steep + 1]) < threshold)
-    return min(int(quiet[-1]) + width // 2, force.size - 1) if quiet.size else steep
+    n = int(np.clip(np.ceil(2 * (sigma / (0.02 * max(float(np.abs(force).max()), 1e-12))) ** 2), 3, force.size // 8))
+    means = running_mean(force, n)
+    change = means[n:] - means[:-n]
+    steep = np.flatnonzero(np.abs(change) > 5 * sigma * np.sqrt(2 / n))
+    return min(int(steep[0]) + n // 2, force.size - 1) if steep.size else force.size - 1
 
 
-@contact_method("direct path")
-def direct_path(depth: Array, force: Array, sigma: float) -> int:
-    """Farthest point from the direct path (Fréchet).
+@contact_method("cumulative sum")
+def cumulative_sum(depth: Array, force: Array, sigma: float) -> int:
+    """Change point by cumulative sum.
 
-    1. Use the curve up to the first fifth of its largest force, and as long a stretch before it at most.
-    2. Scale depth and force to 0...1; draw the straight path from the first to the last point.
-    3. The point farthest below that path is the contact.
+    1. Sum |F| - 2.5 sigma from the first point on: it falls while there is noise only, and rises in contact.
+    2. The contact is where it is least.
     """
-    del sigma
-    stop = min(force.size, max(12, int(np.argmax(np.abs(force) > 0.2 * np.abs(force).max())) or force.size))
-    quiet = int(np.argmax(np.abs(force) > 0.02 * np.abs(force).max()))
-    start = max(0, 2 * quiet - stop)
-    x = (depth[start:stop] - depth[start]) / max(float(np.ptp(depth[start:stop])), 1e-12)
-    y = np.abs(running_mean(force[start:stop], max(3, (stop - start) // 60)))
-    y = (y - y[0]) / max(float(y[-1] - y[0]), 1e-12)
-    return start + int(np.argmax(x - y))
+    del depth
+    return int(np.argmin(np.cumsum(np.abs(force) - 2.5 * sigma)))
 
 
 @extraction_step(
@@ -125,8 +114,7 @@ def direct_path(depth: Array, force: Array, sigma: float) -> int:
 )
 def contact(work: Extraction) -> Details:
     """Find the contact by every registered method on the same curve; the median counts, the spread is reported."""
-    depth, force, first = _approach_curve(work)
-    sigma = work.noise.of_mean((work.windows.approach[1] - first) / force.size) if work.windows.approach else 0.0
+    depth, force, sigma = _approach_curve(work)
     found = {name: -float(depth[method(depth, force, sigma)]) for name, (_, method) in CONTACT_METHODS.items()}
     places = np.array(list(found.values()))
     work.methods["contact_height_m"] = found
@@ -134,26 +122,32 @@ def contact(work: Extraction) -> Details:
     return {"decision": f"median of {len(found)} methods", "methods": found, "separation": -depth, "force": force}
 
 
-def _approach_curve(work: Extraction) -> tuple[Array, Array, int]:
-    """Return depth (rising) and force of the moving part of the approach, in blocks, and its first sample."""
+def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
+    """Return depth (rising evenly) and force of the approach, averaged in cells of depth, and the noise of one cell.
+
+    What noise and drift leave before contact counts where it is larger than the noise alone.
+    """
     if work.windows.approach is None:
         raise FeatureMissing("the run has no approach")
     start, stop = work.windows.approach
     width = max(3, round(0.02 * work.run.rate))
     smooth = running_mean(work.force[start:stop], width)
     top = int(np.argmax(smooth))
-    if smooth[top] < 8 * work.noise.of_mean(width):
+    if smooth[top] < 8 * work.noise.of_mean(width) or start + top <= work.contact_start:
         raise FeatureMissing("the approach ended before contact")
     stop = start + top + 1
-    beyond = stop - work.contact_start
-    start = max(start, work.contact_start - 2 * beyond)
-    length = max(1, (stop - start) // POINTS)
-    depth = -block_means(work.separation[start:stop], length)
-    force = block_means(work.force[start:stop], length)
-    rising = np.concatenate([[True], np.diff(np.maximum.accumulate(depth)) > 0])
-    if int(rising.sum()) < 24:
+    depth = -work.separation[start:stop]
+    touch = float(depth[work.contact_start - start])
+    first = max(float(depth[0]), touch - 2 * (float(depth[-1]) - touch))
+    samples = int(np.count_nonzero((depth > first) & (depth < touch)))
+    cells = int(min(POINTS, samples // 4))
+    if cells < 24:
         raise FeatureMissing("too few samples while the stage approached")
-    return depth[rising], force[rising], start
+    grid = np.linspace(first, float(depth[-1]), cells)
+    per_cell = samples / max(1.0, cells * (touch - first) / (grid[-1] - first))
+    force = on_grid(depth, work.force[start:stop], grid)
+    before = force[grid < touch - 0.1 * (touch - first)]
+    return grid, force, max(work.noise.of_mean(per_cell), float(np.sqrt(np.mean(before**2))))
 
 
 @extraction_step(

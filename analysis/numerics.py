@@ -26,6 +26,17 @@ def block_means(values: Array, length: int) -> Array:
     return np.asarray(values[: count * length].reshape(count, length).mean(axis=1), dtype=np.float64)
 
 
+def on_grid(place: Array, value: Array, grid: Array) -> Array:
+    """Average ``value`` in cells centred on an even ``grid``; empty cells are interpolated."""
+    step = float(grid[1] - grid[0])
+    cell = np.floor((place - grid[0]) / step + 0.5).astype(np.int64)
+    inside = (cell >= 0) & (cell < grid.size)
+    count = np.bincount(cell[inside], minlength=grid.size)
+    total = np.bincount(cell[inside], weights=value[inside], minlength=grid.size)
+    filled = count > 0
+    return np.asarray(np.interp(grid, grid[filled], total[filled] / count[filled]), dtype=np.float64)
+
+
 @dataclass(frozen=True, slots=True)
 class Noise:
     """Noise of a signal, measured where the signal itself is known.

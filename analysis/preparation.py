@@ -133,11 +133,16 @@ def _without_trend(values: Array) -> Array:
 
 
 def _contact_onset(work: Extraction, smooth: Array, level: float, sigma: float) -> int:
+    """Return the first sample of the approach from which the force departs for good: up, or down in a snap-in."""
     window = work.windows.approach
     if window is None:
         return work.windows.free[1]
-    quiet = np.flatnonzero(np.abs(smooth[window[0] : window[1]] - level) < 5 * sigma)
-    return window[0] + (int(quiet[-1]) if quiet.size else 0)
+    departed = (np.abs(smooth[window[0] : window[1]] - level) > 5 * sigma).astype(np.float64)
+    ahead = max(2, round(0.2 * work.run.rate))
+    total = np.concatenate([[0.0], np.cumsum(departed), np.full(ahead, departed.sum())])
+    share = (total[ahead : ahead + departed.size] - total[: departed.size]) / ahead
+    lasting = np.flatnonzero((departed > 0) & (share > 0.8))
+    return window[0] + (int(lasting[0]) if lasting.size else departed.size)
 
 
 def _rough_detachment(work: Extraction, smooth: Array, level: float, sigma: float) -> int | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.numerics import Array
+from analysis.numerics import Array, on_grid
 from analysis.pipeline import Analysis
 from analysis.quantity import Quantity
 from analysis.run import Run
@@ -234,17 +234,6 @@ def band(members: Group, points: int = 400) -> Band | None:
 def _mean_and_deviation(rows: Array) -> tuple[Array, Array]:
     deviation = rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(rows.shape[1])
     return rows.mean(axis=0), np.asarray(deviation, dtype=np.float64)
-
-
-def on_grid(place: Array, value: Array, grid: Array) -> Array:
-    """Average ``value`` in cells centred on an even ``grid``; empty cells are interpolated."""
-    step = float(grid[1] - grid[0])
-    cell = np.floor((place - grid[0]) / step + 0.5).astype(np.int64)
-    inside = (cell >= 0) & (cell < grid.size)
-    count = np.bincount(cell[inside], minlength=grid.size)
-    total = np.bincount(cell[inside], weights=value[inside], minlength=grid.size)
-    filled = count > 0
-    return np.asarray(np.interp(grid, grid[filled], total[filled] / count[filled]), dtype=np.float64)
 
 
 def pooled_frame(groups: Iterable[Group]) -> pd.DataFrame:
