@@ -240,8 +240,13 @@ class Device:
         if not 0 < rate <= highest:
             raise Refusal(-200077, f"Requested sample rate {rate} Hz is not supported; the highest is {highest} Hz.")
         if delta_sigma:
-            return 50e3 / min(int(50e3 / rate), 31)
-        return self.timebase / int(self.timebase / rate)
+            return 50e3 / min(_divisor(50e3, rate), 31)
+        return self.timebase / _divisor(self.timebase, rate)
+
+
+def _divisor(timebase: float, rate: float) -> int:
+    """Return the largest divisor that is not slower than asked; a rate the timebase has divides it exactly."""
+    return int(timebase / rate * (1 + 1e-12))
 
 
 def usb_6211(name: str = "Dev1", **changes: object) -> Device:
