@@ -99,8 +99,8 @@ class HoneywellHSC:
         averaging: float = 0.1,
         quietest: float | None = 2e-4,
     ) -> None:
-        window = round(averaging * rate)
-        if not averaging >= 0.05 or window < 1:
+        window = round(averaging * rate) if averaging >= 0.05 and rate > 0 else 0
+        if window < 1:
             raise ValueError(f"{name}: averaging {averaging} s at {rate} Hz; it must be at least 0.05 s and one sample")
         self.name = name
         self.zero: AutoZero | None = None
