@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -138,10 +138,10 @@ def _solve_block(
     solved = np.zeros(len(scenes), dtype=bool)
     values = {name: np.full(len(scenes), np.nan) for name in FEATURES}
     columns = _columns(scenes, contact_stretch)
-    opened = np.flatnonzero(_start_volume(columns.cone) > 0)
-    if opened.size == 0:
+    opened = np.flatnonzero(_start_volume(columns.cone) > 0).tolist()
+    if not opened:
         return values, solved
-    if opened.size < len(scenes):
+    if len(opened) < len(scenes):
         columns = _columns([scenes[k] for k in opened], contact_stretch)
     try:
         with np.errstate(all="ignore"):
@@ -155,7 +155,7 @@ def _solve_block(
 
 
 def _start_volume(columns: Cone) -> Array:
-    if isinstance(columns.gas, Vented):
+    if not isinstance(columns.gas, Isothermal):
         return np.ones(np.shape(columns.start_radius)[0])
     volume: Array = (columns.gas.anchor + columns.gas.offset + cone.start_growth(columns))[:, 0]
     return volume
@@ -204,6 +204,11 @@ def _columns(scenes: Sequence[Parameters], contact_stretch: bool) -> _Block:
         chamber = V_0 / (np.pi * R_0**3 / 3)
         columns.gas = Isothermal(P_0 / pressure, P_atm / pressure, chamber + growth, -growth)
     return _Block(columns, R_0, np.pi * stiffness * R_0 / 6)
+
+
+def column(values: Array) -> Array:
+    """Return the only column of a matrix."""
+    return values[:, 0]
 
 
 class _Refinement:
@@ -292,7 +297,8 @@ class _Refinement:
         top = np.where(falls.any(axis=1), np.argmax(falls, axis=1), falls.shape[1]) - 1
         later = np.arange(falls.shape[1]) > top[:, None]
         self.fine &= ~(later & ~falls).any(axis=1)
-        return np.minimum(top, falls.shape[1] - 2)
+        last: Array = np.minimum(top, falls.shape[1] - 2)
+        return last
 
     def _end_at_fold(self, top: Array) -> None:
         """Replace the node after the last stable one by the fold, or by the onset where that is the fold."""
@@ -303,7 +309,7 @@ class _Refinement:
         found = self._root(1, before, np.maximum(after, 1), turning)
         radius, t = np.where(turning, found[0], radius), np.where(turning, found[1], t)
         edge = self.cone.edge(radius[:, None])
-        force, climb, force_climb = self._slopes(edge, t[:, None])
+        force, _, force_climb = self._slopes(edge, t[:, None])
         keep = (radius == 0) | corner
         for name, column in (("radius", radius), ("t", t), ("position", self.cone.position(edge, t[:, None])[:, 0])):
             values = getattr(self, name)
@@ -342,20 +348,21 @@ class _Refinement:
         self.fine &= tensile.any(axis=1)
         at_start, pinned = first <= 0, (first > 0) & (last < 0)
         held = bracketed_many(
-            lambda t: (self.cone.state(edge, t[:, None]).force + np.zeros_like(t_0))[:, 0],
+            lambda t: column(self.cone.state(edge, t[:, None]).force + np.zeros_like(t_0)),
             np.where(pinned, t_0[:, 0], 0.0),
             np.where(pinned, self.t[:, 0], 0.0),
             first,
             last,
         )
-        zero = np.where(at_start, start, self.cone.position(edge, held[:, None])[:, 0])
+        zero: Array = np.where(at_start, start, self.cone.position(edge, held[:, None])[:, 0])
         moving = ~at_start & ~pinned
         if not moving.any():
             return zero
         k = np.maximum(np.argmax(tensile, axis=1), 1)
         radius, t = self._root(0, k - 1, k, moving)
         free = self.cone.position(self.cone.edge(radius[:, None]), t[:, None])[:, 0]
-        return np.where(moving, free, zero)
+        zero[moving] = free[moving]
+        return zero
 
     def _root(self, which: int, before: Array, after: Array, wanted: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return radius and t where force (0), dz/drho (1) or dF/drho (2) vanishes between two nodes of each row."""

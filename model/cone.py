@@ -72,7 +72,7 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
             name, outcome, assumptions, evaluations=cone.evaluations, runtime_s=time.perf_counter() - begin
         )
 
-    edge = cone.edge(cone.start_radius)
+    edge = cone.start_edge
     height = cone.start_position + edge.drop
     if isinstance(cone.gas, Isothermal) and cone.gas.anchor + cone.gas.offset + start_growth(cone) <= 0:
         return without_features(Outcome.CHAMBER_CLOSED)
@@ -99,6 +99,7 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         onset_position=path.onset.position * length,
         detachment_position=detachment.position * length,
         detachment_radius=detachment.radius * length,
+        adhesion_energy=adhesion_energy(branch, path, zero, profile) * scales.energy,
         position=profile.position * length,
         retraction=(profile.position - zero.position) * length,
         force=profile.force * force,
@@ -112,7 +113,16 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         },
         runtime_s=time.perf_counter() - begin,
         evaluations=cone.evaluations,
+        warnings=_warnings(cone, height),
     )
+
+
+def _warnings(cone: Cone, height: float) -> tuple[str, ...]:
+    """Return what the reader of a prediction ought to know."""
+    edge = cone.start_edge
+    if cone.sphere is None or edge.gap == 0 or cone.residual(edge, height / edge.gap)[0] <= 0:
+        return ()
+    return ("at z_0 the cone would cut into the sphere; the contact is taken as held at r_i until it clears it",)
 
 
 def nondimensional(parameters: Parameters, contact_stretch: bool) -> tuple[Cone, Scales]:
@@ -151,8 +161,26 @@ def _gas(parameters: Parameters, scales: Scales, cone: Cone) -> Gas:
 
 def start_growth(cone: Cone) -> Number:
     """Return V(z_0, r_i) - V_0, regular also where the contact reaches the rim."""
-    edge, radius = cone.edge(cone.start_radius), cone.start_radius
+    edge, radius = cone.start_edge, cone.start_radius
     return (cone.start_position + edge.drop) * (1 + radius + radius**2) - edge.cap
+
+
+def adhesion_energy(branch: Branch, path: Path, zero: Point, profile: Profile) -> float:
+    """Return the work of the force from its zero to detachment: differences of the potential between the jumps."""
+    if isinstance(branch.cone.gas, Driven):
+        after = profile.position >= zero.position
+        return float(-np.trapezoid(profile.force[after], profile.position[after]))
+    pieces = [(path.pinned.first, path.pinned.last), *((stretch.first, stretch.last) for stretch in path.stretches)]
+    work = 0.0
+    for first, last in pieces:
+        begin = zero if first.position < zero.position <= last.position else first
+        if begin.position >= zero.position and begin.position < last.position:
+            work += _potential(branch.cone, last) - _potential(branch.cone, begin)
+    return work
+
+
+def _potential(cone: Cone, point: Point) -> float:
+    return cone.potential(cone.edge(point.radius), point.t)
 
 
 class Profile(NamedTuple):
@@ -182,7 +210,7 @@ def sample(branch: Branch, path: Path, marks: tuple[Point, ...], points: int) ->
             for stretch in stretches
         ]
     )
-    start = np.interp(radius, branch.radius[::-1], branch.t[::-1])
+    start = branch.guess(radius)
     inner = radius > 0
     free_edge = cone.edge(np.where(inner, radius, branch.radius[-2]))
     free_t = np.where(inner, largest_slope(cone, free_edge, start), branch.t[-1])

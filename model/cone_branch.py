@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from model.prediction import Array
 from model.roots import EPSILON, bracketed
 
 ITERATIONS = 200
+FREE_STEPS = 16
+QUADRATIC = 1e-9
+"""A Newton step this small, and a thousand times smaller than the last, leaves an error below rounding."""
 NOISE = 1e-9
 """Steps below this that no longer shrink are rounding noise; the error estimate says how much of it there is."""
 
@@ -56,21 +59,43 @@ def _balance(edge: Edge, lever: Number) -> Array:
 
 
 def largest_slope(cone: Cone, edge: Edge, start: Array | None = None) -> Array:
-    """Return the largest root t of dPi/drho = 0 for an array of contact radii (Newton, kept inside its bracket)."""
+    """Return the largest root t of dPi/drho = 0 for an array of contact radii.
+
+    Newton's method from ``start`` or from the upper bound; kept inside its bracket if free steps lead astray.
+    """
     low, high = bounds(cone, edge)
     if start is None:
         start, low, high = _cold_start(cone, edge, low, high)
-    t = np.clip(start, low, high)
+    with np.errstate(all="ignore"):
+        free = _free_newton(cone, edge, start)
+        if free is not None and ((free >= low) & (free <= high)).all():
+            return free
+        return _bracketed_newton(cone, edge, np.clip(start, low, high), low, high)
+
+
+def _free_newton(cone: Cone, edge: Edge, t: Array) -> Array | None:
+    """Return the root, or None unless every element converged quadratically on a rising residual."""
+    previous: Array | float = 0.0
+    for _ in range(FREE_STEPS):
+        value, slope = cone.residual(edge, t)
+        step = value / slope
+        t = t - step
+        step = np.abs(step)
+        scale = np.abs(t) + edge.slope
+        if ((step <= 8 * EPSILON * scale) | ((step <= QUADRATIC * scale) & (step <= 1e-3 * previous))).all():
+            return t if (slope > 0).all() else None
+        previous = step
+    return None
+
+
+def _bracketed_newton(cone: Cone, edge: Edge, t: Array, low: Array, high: Array) -> Array:
     previous = np.full_like(t, np.inf)
     for _ in range(ITERATIONS):
-        with np.errstate(all="ignore"):
-            value, slope = cone.residual(edge, t)
-            proposal = t - value / slope
+        value, slope = cone.residual(edge, t)
+        proposal = t - value / slope
         low = np.where(value < 0, t, low)
         high = np.where(value > 0, t, high)
-        outside = ~((proposal >= low) & (proposal <= high))
-        if outside.any():
-            proposal = np.where(outside, (low + high) / 2, proposal)
+        proposal = np.where((proposal >= low) & (proposal <= high), proposal, (low + high) / 2)
         proposal = np.where(value == 0, t, proposal)
         step = np.abs(proposal - t)
         t = proposal
@@ -123,14 +148,15 @@ def tilts(state: State) -> Array:
     return result
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """One equilibrium of the branch."""
 
     radius: float
     t: float
     position: float
     force: float
+    force_climb: float
+    """dF/drho along the branch; zero where the contact is pinned."""
 
 
 class Branch:
@@ -148,8 +174,9 @@ class Branch:
         self.position = cone.position(self.edge, self.t)
         self.climb = -(self.t + self.edge.slope) - self.edge.gap * tilt
         self.force_climb = state.force_radius - state.force_t * tilt
+        self.slope = -tilt
         self._append_centre()
-        self._last = (self.radius[0], self.t[0], -tilt[0])
+        self._last = (float(self.radius[0]), float(self.t[0]), float(self.slope[0]))
 
     def _append_centre(self) -> None:
         """Add the limit r -> 0: the cone of an inflated membrane touching the apex, or no contact at z = 0."""
@@ -159,12 +186,10 @@ class Branch:
         slope = -tilt_of(state) if t > 0 else self._slope_at_apex(state.pressure)
         climb = slope - t
         force_climb = state.force_radius + state.force_t * slope if math.isfinite(slope) else -math.inf
-        self.radius = np.append(self.radius, 0.0)
-        self.t = np.append(self.t, t)
-        self.position = np.append(self.position, t)
-        self.force = np.append(self.force, 0.0 if t > 0 else state.force)
-        self.climb = np.append(self.climb, climb)
-        self.force_climb = np.append(self.force_climb, force_climb)
+        force = 0.0 if t > 0 else state.force
+        names = ("radius", "t", "position", "force", "climb", "force_climb", "slope")
+        for name, value in zip(names, (0.0, t, t, force, climb, force_climb, slope), strict=True):
+            setattr(self, name, np.concatenate((getattr(self, name), (value,))))
 
     def _slope_at_apex(self, pressure: float) -> float:
         """Return dt/drho as r -> 0 without inflation: omega / |P_a| - 1 / r_b; infinite (rho^(1/4)) without suction."""
@@ -183,22 +208,38 @@ class Branch:
             high *= 2
         return bracketed(lambda t: self.cone.state(edge, t).force, 0.0, high, start.force, end)
 
+    def guess(self, radius: Array) -> Array:
+        """Return t between the nodes by Hermite's cubic; linear next to an apex of infinite slope."""
+        k = np.clip(np.searchsorted(-self.radius, -radius, side="right") - 1, 0, self.radius.size - 2)
+        width = self.radius[k + 1] - self.radius[k]
+        x = (radius - self.radius[k]) / width
+        t_a, t_b = self.t[k], self.t[k + 1]
+        secant = t_b - t_a
+        end = self.slope[k + 1] * width
+        end = np.where(np.isfinite(end), end, secant)
+        a, b = self.slope[k] * width - secant, secant - end
+        result: Array = t_a + x * secant + x * (1 - x) * (a * (1 - x) + b * x)
+        return result
+
     def at(self, radius: float) -> tuple[Edge, float]:
         """Return the equilibrium at one radius: Newton from the tangent at the last one, else from scratch."""
         edge = self.cone.edge(radius)
         last_radius, last_t, last_slope = self._last
         t = last_t + last_slope * (radius - last_radius)
+        previous = 0.0
         for _ in range(12):
             value, slope = self.cone.residual(edge, t)
             if not slope > 0:
                 break
             step = value / slope
             t -= step
-            if abs(step) <= 4 * EPSILON * (abs(t) + edge.slope):
+            size, scale = abs(step), abs(t) + edge.slope
+            if size <= 4 * EPSILON * scale or (size <= QUADRATIC * scale and size <= 1e-3 * previous):
                 if t + edge.slope < 0:
                     break
                 self._last = (radius, t, last_slope)
                 return edge, t
+            previous = size
         t = float(largest_slope(self.cone, self.cone.edge(np.array([radius])))[0])
         self._last = (radius, t, last_slope)
         return edge, t
@@ -206,42 +247,44 @@ class Branch:
     def climb_at(self, radius: float) -> float:
         """Return dz/drho along the branch; negative where it is stable under displacement control."""
         edge, t = self.at(radius)
-        state = self.cone.state(edge, t)
-        tilt = tilt_of(state)
+        tilt = tilt_of(self.cone.state(edge, t))
         self._last = (radius, t, -tilt)
         return float(-(t + edge.slope) - edge.gap * tilt)
 
     def force_climb_at(self, radius: float) -> float:
         """Return dF/drho along the branch."""
-        if radius == 0.0:
-            return float(self.force_climb[-1])
-        edge, t = self.at(radius)
-        state = self.cone.state(edge, t)
-        tilt = tilt_of(state)
-        self._last = (radius, t, -tilt)
-        return float(state.force_radius - state.force_t * tilt)
+        return self.point(radius).force_climb
 
     def point(self, radius: float) -> Point:
         """Return the equilibrium at one radius."""
         if radius == 0.0:
-            return Point(0.0, float(self.t[-1]), float(self.position[-1]), float(self.force[-1]))
+            return self.node(-1)
         edge, t = self.at(radius)
-        return Point(radius, t, self.cone.position(edge, t), self.cone.state(edge, t).force)
+        state = self.cone.state(edge, t)
+        tilt = tilt_of(state)
+        self._last = (radius, t, -tilt)
+        position = self.cone.position(edge, t)
+        return Point(radius, t, position, state.force, state.force_radius - state.force_t * tilt)
 
     def node(self, index: int) -> Point:
         """Return a node of the scan."""
-        return Point(
-            float(self.radius[index]), float(self.t[index]), float(self.position[index]), float(self.force[index])
-        )
+        columns = (self.radius, self.t, self.position, self.force, self.force_climb)
+        return Point(*(float(column[index]) for column in columns))
+
+    def nodes(self, indices: range) -> list[Point]:
+        """Return several nodes of the scan."""
+        part = slice(indices.start, indices.stop)
+        columns = (self.radius, self.t, self.position, self.force, self.force_climb)
+        return [Point(*row) for row in zip(*(column[part].tolist() for column in columns), strict=True)]
 
     def turning(self, index: int) -> Point:
         """Return the extremum of z between the nodes ``index`` and ``index + 1``."""
         before, after = self.node(index), self.node(index + 1)
         return self._solve(self.climb_at, before, after, float(self.climb[index]), float(self.climb[index + 1]))
 
-    def lowest_force(self, before: Point, after: Point, slope_before: float, slope_after: float) -> Point:
+    def lowest_force(self, before: Point, after: Point) -> Point:
         """Return the minimum of the force between two points where dF/drho differs in sign."""
-        return self._solve(self.force_climb_at, before, after, slope_before, slope_after)
+        return self._solve(self.force_climb_at, before, after, before.force_climb, after.force_climb)
 
     def where_force_vanishes(self, before: Point, after: Point) -> Point:
         """Return the zero of the force between two points of one stretch of the branch.
@@ -260,7 +303,7 @@ class Branch:
         radius = bracketed(residual, before.radius, after.radius, low, high)
         edge = self.cone.edge(radius)
         t = self._forceless(edge, before.t, after.t)
-        return Point(radius, t, self.cone.position(edge, t), 0.0)
+        return Point(radius, t, self.cone.position(edge, t), 0.0, 0.0)
 
     def _forceless(self, edge: Edge, low: float, high: float) -> float:
         """Return the slope t at which the force vanishes; the force falls with t."""

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from model.cone_branch import Branch, Point
+import numpy as np
+
+from model.cone_branch import Branch, Point, tilt_of
 from model.cone_terms import Cone, Driven, Edge, Isothermal, stretch_energy
+from model.prediction import Array
 from model.roots import EPSILON
 
 SAFETY = 8.0
@@ -41,7 +44,7 @@ def pressure_terms(cone: Cone, edge: Edge, t: float) -> float:
     """Return the summed magnitudes of the terms of the gauge pressure."""
     gas = cone.gas
     if not isinstance(gas, Isothermal):
-        return abs(gas.at(cone.position(edge, t))[0]) if isinstance(gas, Driven) else abs(gas.initial)
+        return float(abs(gas.at(cone.position(edge, t))[0] if isinstance(gas, Driven) else gas.initial))
     change = cone.growth(edge, t) + gas.offset
     terms = edge.gap * abs(t) * (1 + edge.radius + edge.radius**2) + edge.cap + abs(gas.offset)
     return float((abs(gas.initial) * gas.anchor + gas.atmosphere * terms) / (gas.anchor + change))
@@ -72,9 +75,13 @@ def of_features(branch: Branch, zero: Point, peak: Point, detachment: Point) -> 
     return {
         "pull_off_force": at_peak.force,
         "pull_off_distance": at_end.position + zero_position,
+        "retraction_at_pull_off": at_peak.position
+        + zero_position
+        + _radius_at_peak(branch, peak) * _steepness(branch, peak),
         "zero_force_position": zero_position,
         "onset_position": on_branch(branch, branch.node(0)).position,
         "detachment_position": at_end.position,
+        "detachment_radius": _radius_at_fold(branch, detachment),
     }
 
 
@@ -83,7 +90,7 @@ def _anywhere(branch: Branch, point: Point) -> Uncertainty:
 
 
 def _is_pinned(branch: Branch, point: Point) -> bool:
-    return point.radius == branch.cone.start_radius and point.t < branch.t[0]
+    return bool(point.radius == branch.cone.start_radius and point.t < branch.t[0])
 
 
 def _yield(branch: Branch, point: Point) -> float:
@@ -97,3 +104,44 @@ def _yield(branch: Branch, point: Point) -> float:
     climb = point.t + edge.slope + edge.gap * tilt
     force_climb = state.force_radius - state.force_t * tilt
     return abs(climb / force_climb) if force_climb else 0.0
+
+
+def _radius_at_fold(branch: Branch, fold: Point) -> float:
+    """Return the error of the radius where dz/drho vanishes; none where an end of the branch is the fold."""
+    if _is_end(branch, fold):
+        return 0.0
+    edge, tilt = _edge_and_tilt(branch, fold)
+    terms = float(abs(fold.t) + edge.slope + edge.gap * abs(tilt))
+    return SAFETY * EPSILON * (fold.radius + terms / _bend(branch, branch.climb, fold.radius))
+
+
+def _radius_at_peak(branch: Branch, peak: Point) -> float:
+    """Return the error of the radius where dF/drho vanishes; none at the onset."""
+    if _is_end(branch, peak) or _is_pinned(branch, peak):
+        return 0.0
+    edge, tilt = _edge_and_tilt(branch, peak)
+    state = branch.cone.state(edge, peak.t)
+    terms = float(abs(state.force_radius) + abs(state.force_t * tilt))
+    return SAFETY * EPSILON * (peak.radius + terms / _bend(branch, branch.force_climb, peak.radius))
+
+
+def _is_end(branch: Branch, point: Point) -> bool:
+    return point.radius in (0.0, branch.cone.start_radius)
+
+
+def _edge_and_tilt(branch: Branch, point: Point) -> tuple[Edge, float]:
+    edge = branch.cone.edge(point.radius)
+    return edge, tilt_of(branch.cone.state(edge, point.t))
+
+
+def _steepness(branch: Branch, point: Point) -> float:
+    """Return |dz/drho| along the branch."""
+    edge, tilt = _edge_and_tilt(branch, point)
+    return float(abs(point.t + edge.slope + edge.gap * tilt))
+
+
+def _bend(branch: Branch, slopes: Array, radius: float) -> float:
+    """Return the magnitude of the derivative of a slope between the two nodes around a radius."""
+    k = min(int(np.searchsorted(-branch.radius, -radius)), branch.radius.size - 1)
+    bend = abs(slopes[k] - slopes[k - 1]) / (branch.radius[k - 1] - branch.radius[k])
+    return float(bend) if np.isfinite(bend) and bend > 0 else 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,10 @@ class Stretch:
     first: Point
     last: Point
     nodes: range
+
+    def points(self, branch: Branch) -> list[Point]:
+        """Return its ends and the nodes of the scan between them."""
+        return [self.first, *branch.nodes(self.nodes), self.last]
 
 
 @dataclass(frozen=True)
@@ -62,40 +67,36 @@ def _stretches(branch: Branch) -> list[Stretch]:
     begin = 0
     last = len(branch.radius) - 1
     falls = branch.climb > 0  # z falls as the radius shrinks: unstable
-    landed: Point | None = branch.node(0)
-    for index in range(last + 1):
-        if index < last and not falls[index] and falls[index + 1]:
-            top, end = branch.turning(index), index
-        elif (index == 0 and falls[0]) or (index == last and not falls[last]):
-            top, end = branch.node(index), index - 1
-        elif index < last and falls[index] and not falls[index + 1]:
+    landed = branch.node(0)
+    turns = np.flatnonzero(falls[1:] != falls[:-1]).tolist()
+    for index in ([-1] if falls[0] else []) + turns + ([] if falls[last] else [last]):
+        if 0 <= index < last and falls[index]:
             trough, begin = branch.turning(index), index + 1
             continue
-        else:
-            continue
+        top = branch.turning(index) if 0 <= index < last else branch.node(max(index, 0))
         if path:
             level = path[-1].last.position
             if top.position <= level or trough is None:
                 continue
             landed = branch.where_position_is(level, trough, top)
-        assert landed is not None
-        inside = [k for k in range(begin, end + 1) if top.radius < branch.radius[k] < landed.radius]
-        path.append(Stretch(landed, top, range(inside[0], inside[-1] + 1) if inside else range(0)))
+        inside = np.flatnonzero((branch.radius < landed.radius) & (branch.radius > top.radius))
+        inside = inside[inside >= begin]
+        path.append(Stretch(landed, top, range(inside[0], inside[-1] + 1) if inside.size else range(0)))
     return path
 
 
 def _pinned_point(branch: Branch, t: float) -> Point:
     cone = branch.cone
-    edge = cone.edge(cone.start_radius)
-    return Point(cone.start_radius, t, cone.position(edge, t), cone.state(edge, t).force)
+    edge = cone.start_edge
+    return Point(cone.start_radius, t, cone.position(edge, t), cone.state(edge, t).force, 0.0)
 
 
 def pinned_points(branch: Branch, path: Path) -> list[Point]:
-    """Return points of the pinned part among which the force is monotonic: its ends, or many under a measured pressure."""
+    """Return the ends of the pinned part, where the force is monotonic; many points under a measured pressure."""
     first, last = path.pinned.first, path.pinned.last
     if not isinstance(branch.cone.gas, Driven):
         return [first, last]
-    edge = branch.cone.edge(branch.cone.start_radius)
+    edge = branch.cone.start_edge
     knots = (branch.cone.gas.position + edge.drop) / edge.gap if edge.gap > 0 else np.empty(0)
     slopes = np.unique(np.concatenate((np.linspace(first.t, last.t, PINNED_NODES), knots)))
     inner = slopes[(slopes > first.t) & (slopes < last.t)]
@@ -107,14 +108,13 @@ def zero_of_force(branch: Branch, path: Path) -> Point | None:
     pinned = pinned_points(branch, path)
     if pinned[0].force < 0:
         return pinned[0]
-    for before, after in zip(pinned, pinned[1:], strict=False):
+    for before, after in itertools.pairwise(pinned):
         if after.force < 0:
             return _pinned_zero(branch, before, after)
     for stretch in path.stretches:
-        points = [stretch.first, *(branch.node(k) for k in stretch.nodes), stretch.last]
-        if points[0].force < 0:
-            return points[0]
-        for before, after in zip(points, points[1:], strict=False):
+        if stretch.first.force < 0:
+            return stretch.first
+        for before, after in itertools.pairwise(stretch.points(branch)):
             if after.force < 0:
                 return branch.where_force_vanishes(before, after)
     return None
@@ -122,7 +122,7 @@ def zero_of_force(branch: Branch, path: Path) -> Point | None:
 
 def _pinned_zero(branch: Branch, before: Point, after: Point) -> Point:
     cone = branch.cone
-    edge = cone.edge(cone.start_radius)
+    edge = cone.start_edge
     t = bracketed(lambda t: cone.state(edge, t).force, before.t, after.t, before.force, after.force)
     return _pinned_point(branch, t)
 
@@ -138,13 +138,12 @@ def strongest_pull(branch: Branch, path: Path) -> Point:
 
 def _strongest_of(branch: Branch, stretch: Stretch) -> Point:
     """Return the lowest force of a stretch: a node, or the minimum between two whose slopes dF/dr differ in sign."""
-    points = [stretch.first, *(branch.node(k) for k in stretch.nodes), stretch.last]
+    points = stretch.points(branch)
     lowest = min(range(len(points)), key=lambda k: points[k].force)
     around = range(max(lowest - 1, 0), min(lowest + 1, len(points) - 1) + 1)
-    slopes = {k: branch.force_climb_at(points[k].radius) for k in around}
     best = points[lowest]
     for k in around[:-1]:
-        if slopes[k] > 0 > slopes[k + 1]:
-            inner = branch.lowest_force(points[k], points[k + 1], slopes[k], slopes[k + 1])
+        if points[k].force_climb > 0 > points[k + 1].force_climb:
+            inner = branch.lowest_force(points[k], points[k + 1])
             best = min(best, inner, key=lambda point: point.force)
     return best

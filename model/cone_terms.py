@@ -11,8 +11,8 @@ Every formula is written once and takes floats as well as arrays; only the funct
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,6 +140,11 @@ class Cone:
     contact_stretch: bool
     evaluations: dict[str, int] = field(default_factory=dict)
 
+    @cached_property
+    def start_edge(self) -> Edge:
+        """The contact edge at r_i."""
+        return self.edge(self.start_radius)
+
     def edge(self, radius: Number) -> Edge:
         """Return what depends on the contact radius alone; a flat needs neither cap nor contact stretch."""
         gap = 1 - radius
@@ -210,7 +215,7 @@ class Cone:
         """Return Pi (EML Eq. 1) up to a constant; floats only, not for a measured pressure."""
         radius = edge.radius
         energy = (1 + radius) * edge.gap * stretch_energy(t)[0] - self.adhesion * radius**2 / 2
-        if self.sphere is not None and self.contact_stretch:
+        if self.sphere is not None and self.contact_stretch and radius > 0:
             excess = arc_excess(radius / self.sphere)
             energy += (radius * excess * (2 + excess) / (1 + excess)) ** 2
         if isinstance(self.gas, Isothermal):

@@ -311,14 +311,15 @@ class _Polish:
         if not tensile.size:
             raise NotConverged("reference: the force never becomes tensile")
         k = int(tensile[0])
-        low, high = (self.z[k - 1], self.z[k]) if k else (onset, self.z[0])
-        height = high - low + 1e-3 * self.march.r_i
+        z_low, z_high = (self.z[k - 1], self.z[k]) if k else (float(onset), self.z[0])
+        r_low, r_high = self.r[k], self.r[k - 1] if k else self.march.r_i
+        margin = r_high - r_low + 1e-3 * self.march.r_i
 
         def forceless(r: Any) -> Any:
-            return self.root(lambda z: self.force(r, z), low - height, high + height, 24)
+            return self.root(lambda z: self.force(r, z), z_low - 4 * margin, z_high + 4 * margin, 24)
 
-        r = self.root(lambda r: self.derivative(r, forceless(r), 1, 0), self.r[k], self.r[k - 1] if k else self.r_i, 24)
-        return forceless(r)
+        r_high = min(self.r_i, mpmath.mpf(r_high + margin))
+        return forceless(self.root(lambda r: self.derivative(r, forceless(r), 1, 0), r_low - margin, r_high, 24))
 
     def peak(self, onset: Any, detachment: tuple[Any, Any]) -> tuple[Any, Any]:
         """Return the most tensile force and its z."""

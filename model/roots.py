@@ -12,19 +12,17 @@ from model.prediction import Array
 EPSILON = 2.220446049250313e-16
 
 
-def bracketed(
-    function: Callable[[float], float], a: float, b: float, fa: float, fb: float, guess: float | None = None
-) -> float:
+def bracketed(function: Callable[[float], float], a: float, b: float, fa: float, fb: float) -> float:
     """Return the root between ``a`` and ``b``, where the function takes the values ``fa`` and ``fb`` of opposite sign.
 
     Chandrupatla's method (Advances in Engineering Software 28, 1997): inverse quadratic steps where they are safe,
-    bisection otherwise. ``guess`` is tried first.
+    bisection otherwise; the secant is tried first.
     """
     if fa == 0.0:
         return a
     if fb == 0.0:
         return b
-    fraction = 0.5 if guess is None else min(max((guess - a) / (b - a), 1e-6), 1 - 1e-6)
+    fraction = min(max(fa / (fa - fb), 0.01), 0.99) if fa != fb else 0.5
     for _ in range(200):
         x = a + fraction * (b - a)
         fx = function(x)
@@ -35,7 +33,7 @@ def bracketed(
             b, fb = a, fa
         a, fa = x, fx
         best = a if abs(fa) < abs(fb) else b
-        tolerance = 2 * EPSILON * abs(best) + 5e-324
+        tolerance = 4 * EPSILON * abs(best) + 5e-324
         limit = tolerance / abs(b - a) if b != a else 1.0
         if limit > 0.5 or fa == 0.0 or fb == 0.0:
             return best
@@ -45,8 +43,8 @@ def bracketed(
 
 
 def _fraction(a: float, b: float, c: float, fa: float, fb: float, fc: float) -> float:
-    if c == b or fc == fb or fb == fa:
-        return fa / (fa - fb) if fa != fb else 0.5
+    if c == b or fb in (fc, fa):
+        return 0.5
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
     if phi**2 < xi and (1 - phi) ** 2 < 1 - xi:
         step = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 from model.errors import InvalidParameter
@@ -65,7 +66,8 @@ def check(parameters: Parameters) -> None:
         raise InvalidParameter(f"omega_a = {membrane.work_of_adhesion:g} J/m^2 must be finite and at least 0")
     if not math.isfinite(gas.initial_pressure) or gas.initial_pressure <= -gas.atmospheric_pressure:
         raise InvalidParameter(
-            f"P_0 = {gas.initial_pressure:g} Pa (gauge) must be finite and above vacuum, -{gas.atmospheric_pressure:g} Pa"
+            f"P_0 = {gas.initial_pressure:g} Pa (gauge) must be finite and above vacuum, "
+            f"-{gas.atmospheric_pressure:g} Pa"
         )
     if gas.anchor is GasAnchor.MEASURED:
         _check_measured(parameters)
@@ -87,7 +89,7 @@ def _check_measured(parameters: Parameters) -> None:
         )
     if not all(map(math.isfinite, (*position, *pressure))):
         raise InvalidParameter("measured pressure: every position and pressure must be finite")
-    if any(after <= before for before, after in zip(position, position[1:], strict=False)):
+    if any(after <= before for before, after in itertools.pairwise(position)):
         raise InvalidParameter("measured pressure: the positions must rise strictly")
     if min(pressure) <= -gas.atmospheric_pressure:
         raise InvalidParameter(f"measured pressure: {min(pressure):g} Pa (gauge) lies below vacuum")
