@@ -14,6 +14,8 @@ class DeviceError(Exception):
         What the operator can do about it.
     """
 
+    exit_code = 6
+
     def __init__(self, device: str, message: str, remedy: str = "") -> None:
         self.device = device
         self.message = message

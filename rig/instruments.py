@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class Opened:
-    """The open instruments of a run."""
+    """The open instruments of a run; ``converter`` makes a fresh converter for each time the loop begins."""
 
     stage: Stage
     pump: Pump | None
     daq: Daq
     clock: Clock
-    converter: SensorConverter
+    converter: Callable[[], SensorConverter]
     virtual: bool = False
     observers: list[Observer] = field(default_factory=list)
     shut_down: Callable[[], None] = lambda: None
@@ -99,7 +99,7 @@ def _open_direct(request: Request, emulated: EmulatedBench) -> Opened:
         emulated.pump() if pressure else None,
         daq,
         emulated.clock,
-        sensor_converter(bench, pressure, daq.rate),
+        lambda: sensor_converter(bench, pressure, daq.rate),
     )
 
 
@@ -114,7 +114,7 @@ def _open_wired(bench: Bench, pressure: bool, clock: Clock, connections: dict[st
     except BaseException:
         release(stage, pump, None)
         raise
-    return Opened(stage, pump, daq, clock, sensor_converter(bench, pressure, daq.rate))
+    return Opened(stage, pump, daq, clock, lambda: sensor_converter(bench, pressure, daq.rate))
 
 
 def open_stage(bench: Bench, clock: Clock = time.perf_counter, connections: dict[str, str] | None = None) -> Stage:

@@ -204,7 +204,7 @@ class Loop:
             volts = daq.read(self._frame_samples)
             arrived = clock()
             force, pressure = self._checked(volts)
-            status = stage.status()
+            self._stage_status = status = stage.status()
             frame = Frame(number, self.samples, daq.rate, volts, force, pressure, status, self._poll_pump(number))
             self._take(frame, timebase, arrived)
             yield frame

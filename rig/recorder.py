@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from drivers.interfaces import PumpState, PumpStatus, StageStatus
 from rig.errors import FileError
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase
+from rig.seal import seal
 from sequences.frame import Frame
 
 FORMAT = "membrane-adhesion-rig recording 1"
@@ -45,6 +46,7 @@ EVENTS = np.dtype([("sample", "<i8"), ("kind", "S12"), ("text", "S400")])
 PREDICTIONS = np.dtype([("sample", "<i8"), ("json", "S16000")])
 ENDING = np.dtype([("reason", "S400"), ("exit_code", "<i4"), ("samples", "<i8"), ("ended", "S40")])
 
+_COMMIT = "frames"
 _STAGE_FLAGS = ("moving", "on_target", "servo_on", "negative_limit", "positive_limit")
 _PUMP_STATES = tuple(PumpState)
 
@@ -198,8 +200,8 @@ class Recorder:
             The disk is full or gone; what was acknowledged before stays readable.
         """
         try:
-            for name, blocks in self._pending.items():
-                _extend(self._sets[name], blocks)
+            for name in sorted(self._pending, key=_COMMIT.__eq__):  # the frames' table goes last: it commits the rest
+                _extend(self._sets[name], self._pending[name])
         except (OSError, RuntimeError) as error:
             raise FileError(
                 f"recording {self.path}: writing failed after {self.acknowledged} samples ({error}). "
@@ -217,6 +219,7 @@ class Recorder:
             self.flush()
         finally:
             self._file.close()
+        seal(self.path)
 
     def _put(self, name: str, block: NDArray[Any]) -> None:
         self._pending.setdefault(name, []).append(block)

@@ -20,6 +20,7 @@ from rig.errors import FileError
 from rig.observe import StepPhase
 from rig.recorder import ENDING, FORMAT
 from rig.scene import Scene, parse_scene
+from rig.seal import is_sealed, probe
 
 _PER_SAMPLE = ("raw/volts", "data/time", "data/force", "data/height", "data/pressure")
 _PER_FRAME = ("raw/frames", "raw/stage")
@@ -48,10 +49,18 @@ def open_recording(path: Path) -> Iterator[h5py.Group]:
     """
     if not path.is_file():
         raise FileError(f"recording {path}: no such file. Remedy: check the path.")
-    if _is_marked_open(path) and not _writer_lives(path):
-        recover(path)
+    if not is_sealed(path):
+        probe(path)
+        if _is_marked_open(path) and not _writer_lives(path):
+            recover(path)
     with _opened(path, swmr=_is_marked_open(path)) as file:
         yield _entry(file, path)
+
+
+def read_through(path: Path) -> None:
+    """Read everything a recording holds, in a process that may be killed for it; see ``rig.seal``."""
+    with _opened(path, swmr=_is_marked_open(path)) as file:
+        _load(_entry(file, path), path)
 
 
 def recover(path: Path, *, force: bool = False) -> Recovery:
@@ -136,13 +145,7 @@ def load_recording(path: Path) -> Recording:
         As ``open_recording``; or a part is missing or does not fit the others.
     """
     with open_recording(path) as entry:
-        try:
-            return _read(entry, path)
-        except (KeyError, ValueError, OSError, RuntimeError, TypeError, UnicodeDecodeError) as error:
-            raise FileError(
-                f"recording {path}: incomplete or damaged ({error}). Remedy: try `rig recover`; "
-                "otherwise open it with h5py and save what is there."
-            ) from error
+        return _load(entry, path)
 
 
 def load_run(path: Path) -> Run:
@@ -203,6 +206,33 @@ def sensors(bench: Bench) -> Sensors:
     )
 
 
+def _load(entry: h5py.Group, path: Path) -> Recording:
+    try:
+        _check_sizes(entry, path)
+        return _read(entry, path)
+    except FileError:
+        raise
+    except (LookupError, ValueError, OSError, RuntimeError, TypeError, AttributeError, MemoryError) as error:
+        raise FileError(
+            f"recording {path}: incomplete or damaged ({error}). Remedy: try `rig recover`; "
+            "otherwise open it with h5py and save what is there."
+        ) from error
+
+
+def _check_sizes(entry: h5py.Group, path: Path) -> None:
+    """Refuse a file that claims more data than it can hold before memory is asked for them."""
+    claimed = 0
+
+    def count(name: str, item: Any) -> None:
+        nonlocal claimed
+        if isinstance(item, h5py.Dataset):
+            claimed = max(claimed, item.size * item.dtype.itemsize)
+
+    entry.visititems(count)
+    if claimed > 2 * path.stat().st_size:
+        raise FileError(f"recording {path}: damaged: it claims {claimed} bytes of data. Remedy: restore a copy.")
+
+
 def _read(entry: h5py.Group, path: Path) -> Recording:
     samples, frames = _complete(entry)
     configuration = {name: item.asstr()[()] for name, item in entry["configuration"].items()}
@@ -221,24 +251,38 @@ def _read(entry: h5py.Group, path: Path) -> Recording:
         volts=np.ascontiguousarray(volts[:samples].T),
         frames=entry["raw/frames"][:frames],
         stage=entry["raw/stage"][:frames],
-        pump=None if pump is None else pump[:],
+        pump=None if pump is None else _filled(pump[:]),
         force=entry["data/force"][:samples],
         pressure=None if pressure is None else pressure[:samples],
         height=entry["data/height"][:samples],
-        steps=entry["steps"][:],
-        events=entry["events"][:],
-        predictions=entry["predictions"][:],
+        steps=_filled(entry["steps"][:]),
+        events=_filled(entry["events"][:]),
+        predictions=_filled(entry["predictions"][:]),
         ending=None if not len(ending) else (ending[0]["reason"].decode(errors="ignore"), int(ending[0]["exit_code"])),
     )
 
 
 def _complete(entry: h5py.Group) -> tuple[int, int]:
-    """Return samples and frames up to the last frame that every stream holds whole."""
+    """Return samples and frames up to the last frame that every stream holds whole.
+
+    A flush writes the frames' table last. A program that dies inside a flush can leave rows that were made but not yet
+    filled; they do not follow on from the row before.
+    """
     limit = min(entry[name].shape[0] for name in _PER_SAMPLE if name in entry)
     frames = entry["raw/frames"][: min(entry[name].shape[0] for name in _PER_FRAME)]
     stops = frames["start"] + frames["samples"]
-    whole = int(np.searchsorted(stops, limit, side="right"))
+    follows = (frames["start"] == np.concatenate(([0], stops[:-1]))) & (frames["samples"] > 0) & (stops <= limit)
+    whole = int(follows.argmin()) if not follows.all() else len(frames)
     return (int(stops[whole - 1]) if whole else 0), whole
+
+
+def _filled(table: NDArray[Any]) -> NDArray[Any]:
+    """Return the table without the unfilled rows at its end."""
+    blank = np.zeros(1, table.dtype)[0]
+    length = len(table)
+    while length and table[length - 1] == blank:
+        length -= 1
+    return table[:length]
 
 
 @contextmanager
@@ -314,7 +358,8 @@ def _copy_group(source: h5py.Group, target: h5py.Group, samples: int, frames: in
         if item.shape == ():
             copied = target.create_dataset(name, data=item[()], dtype=item.dtype)
         else:
+            data = item[:keep] if keep is not None else _filled(item[:])
             copied = target.create_dataset(
-                name, data=item[:keep], dtype=item.dtype, maxshape=item.maxshape, chunks=item.chunks
+                name, data=data, dtype=item.dtype, maxshape=item.maxshape, chunks=item.chunks
             )
         copied.attrs.update(item.attrs)

@@ -166,7 +166,7 @@ def _loop(
     frame_samples = max(1, round(bench.daq.frame_ms * 1e-3 * opened.daq.rate))
     return Loop(
         instruments,
-        opened.converter,
+        opened.converter(),
         interlocks,
         recorder,
         reporter,

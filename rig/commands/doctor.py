@@ -33,8 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
         well = well and finding.well
         rows.append(asdict(finding))
         if not arguments.json:
-            remedy = f"\n{'':23}-> {finding.remedy}" if finding.remedy and not finding.well else ""
-            print(f"{'ok' if finding.well else 'NOT OK':<8}{finding.what:<15}{finding.seen}{remedy}", flush=True)
+            remedy = f"\n{'':33}-> {finding.remedy}" if finding.remedy and not finding.well else ""
+            print(f"{'ok' if finding.well else 'NOT OK':<8}{finding.what:<24} {finding.seen}{remedy}", flush=True)
     if arguments.json:
         print(json.dumps(rows, indent=2))
     return 0 if well else 1

@@ -1,0 +1,175 @@
+"""Whole runs on the emulated bench."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+
+import h5py
+import numpy as np
+import pytest
+
+from drivers.emulated.faults import Fault, Faults
+from rig.errors import FileError, Refused
+from rig.observe import Controls, StepPhase, Watcher
+from rig.recording import load_recording, load_run
+from rig.replay import Pace
+from rig.replay_session import replay
+from rig.session import run_scene
+
+
+def raw(path):
+    recording = load_recording(path)
+    return recording.volts, recording.frames, recording.stage
+
+
+def test_a_vented_scene_runs_to_its_end_and_detaches(request_for):
+    request = request_for()
+    ending = run_scene(request)
+    assert ending.exit_code == 0, ending.reason
+    run = load_run(request.out)
+    assert [step.name for step in run.steps] == [
+        "tare",
+        "approach",
+        "preload",
+        "dwell",
+        "retract",
+        "pull-off",
+        "return",
+    ]
+    assert run.pressure is None
+    zero = run.force[: run.steps[0].stop].mean()
+    assert run.force.max() - zero > 0.3
+    assert run.force.min() - zero < -0.1
+    assert abs(run.force[-200:].mean() - zero) < 0.02
+
+
+def test_the_wire_and_the_direct_back_end_record_the_same(request_for, tmp_path):
+    for wire, name in ((True, "wire.h5"), (False, "direct.h5")):
+        assert run_scene(request_for(wire=wire, out=tmp_path / name)).exit_code == 0
+    for ours, theirs in zip(raw(tmp_path / "wire.h5"), raw(tmp_path / "direct.h5"), strict=True):
+        assert np.array_equal(ours, theirs)
+
+
+def test_one_seed_is_one_run_and_another_is_another(request_for, tmp_path):
+    for seed, name in ((1, "a.h5"), (1, "b.h5"), (2, "c.h5")):
+        assert run_scene(request_for(seed=seed, out=tmp_path / name)).exit_code == 0
+    first, again, other = (raw(tmp_path / name)[0] for name in ("a.h5", "b.h5", "c.h5"))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first[:, :500], other[:, :500])
+
+
+def test_pressure_is_reached_in_closed_loop(request_for):
+    request = request_for("sphere-60mm-low")
+    ending = run_scene(request)
+    assert ending.exit_code == 0, ending.reason
+    run = load_run(request.out)
+    start = run.step("retract").start
+    assert run.pressure[start - 300 : start].mean() == pytest.approx(-3200.0, abs=50.0)
+
+
+def test_replay_is_identical_to_the_bit(request_for):
+    request = request_for("sphere-60mm-low")
+    assert run_scene(request).exit_code == 0
+    assert replay(load_recording(request.out), pace=Pace()).differences == ()
+
+
+def test_replay_sees_a_changed_bit(request_for):
+    request = request_for()
+    run_scene(request)
+    with h5py.File(request.out, "r+") as file:
+        file["entry/data/force"][1234] += 1e-12
+    assert replay(load_recording(request.out), pace=Pace()).differences
+
+
+class StopIn(Watcher):
+    """Asks for something when a step begins."""
+
+    def __init__(self, controls, step, wish):
+        self._controls, self._step, self._wish = controls, step, wish
+
+    def step(self, event):
+        if event.phase is StepPhase.STARTED and event.name == self._step:
+            getattr(self._controls, self._wish)()
+
+
+@pytest.mark.parametrize("wish", ["stop", "emergency_stop"])
+def test_the_operator_can_end_any_run(request_for, wish):
+    controls = Controls()
+    request = request_for(controls=controls, observers=[StopIn(controls, "dwell", wish)])
+    ending = run_scene(request)
+    assert ending.exit_code == 130
+    recording = load_recording(request.out)
+    assert recording.step_table()[-1].name == "dwell"
+    assert recording.force.size == ending.samples
+    assert replay(recording, pace=Pace()).differences == ()
+
+
+def test_ctrl_c_ends_the_run_in_good_order(request_for):
+    class Press(Watcher):
+        def step(self, event):
+            if event.phase is StepPhase.STARTED and event.name == "preload":
+                signal.raise_signal(signal.SIGINT)
+
+    ending = run_scene(request_for(observers=[Press()]))
+    assert ending.exit_code == 130
+    assert "preload" in ending.reason
+
+
+def test_hold_keeps_recording_and_resume_goes_on(request_for):
+    controls = Controls()
+
+    class HoldAWhile(StopIn):
+        frames = 0
+
+        def frame(self, frame):
+            self.frames += 1
+            if self.frames == 400:
+                controls.hold()
+            if self.frames == 500:
+                controls.resume()
+
+    request = request_for(controls=controls, observers=[HoldAWhile(controls, "", "")])
+    assert run_scene(request).exit_code == 0
+    recording = load_recording(request.out)
+    held = recording.height[402 * 20 : 498 * 20]
+    assert np.ptp(held) < 5e-6
+    assert [row["text"] for row in recording.events if row["kind"] == b"operator"] == [b"hold", b"resume"]
+    assert replay(recording, pace=Pace()).differences == ()
+
+
+def test_force_over_the_limit_stops_the_stage_and_keeps_the_recording(request_for):
+    request = request_for(protocol={"preload_N": 0.5})
+    limits = request.bench.limits.model_copy(update={"compression_N": 0.4})
+    bench = request.bench.model_copy(update={"limits": limits})
+    with pytest.raises(Refused, match="preload_N"):
+        run_scene(dataclasses.replace(request, bench=bench))
+    request = request_for(
+        faults=Faults([Fault("force", "over_range", at_step="preload", after_samples=100, value=3.5)])
+    )
+    ending = run_scene(request)
+    assert ending.exit_code == 3
+    assert "Remedy" in ending.reason
+    recording = load_recording(request.out)
+    assert recording.force.size == ending.samples
+    assert replay(recording, pace=Pace()).differences == ()
+
+
+def test_an_observer_that_fails_harms_nothing(request_for):
+    class Broken(Watcher):
+        def frame(self, frame):
+            raise RuntimeError("painting failed")
+
+    request = request_for(observers=[Broken()])
+    assert run_scene(request).exit_code == 0
+    warnings = [row["text"] for row in load_recording(request.out).events if row["kind"] == b"warning"]
+    assert len(warnings) == 1
+    assert b"painting failed" in warnings[0]
+
+
+def test_a_recording_is_never_overwritten(request_for):
+    request = request_for()
+    request.out.write_bytes(b"precious")
+    with pytest.raises(FileError, match="--out"):
+        run_scene(request)
+    assert request.out.read_bytes() == b"precious"
