@@ -1,8 +1,8 @@
 """Live prediction: before pull-off, where the model says it will be, and how sure that is.
 
 From the moment P_0 is reached the curve for the measured P_0 is known; from then on every stretch of the retraction
-tells more of the specimen, and the band narrows. The prediction names the last frame it used. In virtual time it is made
-at fixed frames on the loop's own thread, so that runs stay identical; in real time a process of its own makes it.
+tells more of the specimen, and the band narrows. Each prediction names the last frame it used. How predictions are made
+beside a run is in ``rig.live_run``.
 """
 
 from __future__ import annotations
@@ -16,15 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.live_data import Evidence, Gathering
-from rig.observe import StepEvent
-from sequences.frame import Frame
+from rig.live_data import Evidence
 
 if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-
     from model import Parameters
-    from rig.live_fit import Curves, Doubt, Estimator, Fit
+    from rig.live_fit import Doubt, Estimator, Fit
 
 Array = NDArray[np.float64]
 
@@ -38,6 +34,8 @@ NINETY = 1.6449
 """Half the width of a normal 90 % interval, in standard deviations."""
 SURPRISE = 4.0
 """Data have left the band when they lie so many standard deviations from the announced curve, twice running."""
+PASSED = 0.99
+"""F_p has been reached once the tension is down to this part of its peak: the model's curves have a single one."""
 LEAST_WAY = 0.03
 """Of D_p: pull-off is never announced nearer than this, the model's own end may be behind."""
 
@@ -301,11 +299,13 @@ class _Announcement:
 
     def _ends(self) -> Array:
         """(draws,), heights at detachment: the model's end, moved by the values, the rest of the way in doubt."""
-        slope = np.array([(c.end - self._curves.end) / step for step, c in map(self._fit.slopes.get, self._names)])
+        moved = [self._fit.slopes[name] for name in self._names]
+        slope = np.array([(curves.end - self._curves.end) / step for step, curves in moved])
         ends = self._curves.end + self._moves @ slope
         way = np.maximum(ends - self._now, self._least_way()) * np.exp(self._predictor.way_doubt * self._way)
         shifted = way + self._predictor.end_doubt * (self._curves.end - self._zero_height) * self._shape[:, 0]
-        return self._now + np.maximum(shifted, self._least_way() / 3)
+        ends_drawn: Array = self._now + np.maximum(shifted, self._least_way() / 3)
+        return ends_drawn
 
     @staticmethod
     def _interval(middle: float, drawn: Array) -> Estimate:
@@ -360,9 +360,7 @@ class _Announcement:
 
     def _force_at(self, place: Array) -> tuple[Array, Array]:
         fit = self._fit
-        shift, covariance, _ = self._conditioned(
-            place, "force", fit.force_residual, fit.force_kernel, fit.force_shape
-        )
+        shift, covariance, _ = self._conditioned(place, "force", fit.force_residual, fit.force_kernel, fit.force_shape)
         force = np.interp(place, self._curves.height, self._curves.force) + shift
         return force, np.sqrt(np.maximum(np.diag(covariance), 0.0) + self._evidence.force_noise**2)
 
@@ -379,18 +377,17 @@ class _Announcement:
     def _pull_off_force(self) -> Estimate:
         """The peak: what has been reached, or what is still to come."""
         reached = float(self._tension.max()) if self._tension.size else 0.0
-        if self._curves.end <= self._now:
-            return Estimate(reached, reached, reached * 1.02)
+        sigma = self._sigma("force_zero")
+        passed = self._tension.size and self._tension[-1] < PASSED * reached - 5 * self._evidence.force_noise
+        if passed or self._curves.end <= self._now:
+            return Estimate(reached, reached - NINETY * sigma, reached + NINETY * sigma)
         place = np.linspace(self._now, self._curves.end, POINTS)
         fit = self._fit
-        shift, covariance, _ = self._conditioned(
-            place, "force", fit.force_residual, fit.force_kernel, fit.force_shape
-        )
+        shift, covariance, _ = self._conditioned(place, "force", fit.force_residual, fit.force_kernel, fit.force_shape)
         middle = np.interp(place, self._curves.height, self._curves.force) + shift
         root = np.linalg.cholesky(covariance + 1e-9 * np.eye(place.size))
         drawn = middle + self._shape @ root.T
-        zero = np.sqrt(self._fit.covariance[self._names.index("force_zero")][self._names.index("force_zero")])
-        peaks = np.maximum(-drawn.min(axis=1), reached) + zero * self._way[::-1]
+        peaks = np.maximum(-drawn.min(axis=1), reached) + sigma * self._way[::-1]
         return self._interval(max(reached, float(-middle.min())), peaks)
 
     # -- what was learnt

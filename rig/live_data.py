@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,25 @@ REST_S = 0.5
 """P_0 is the mean pressure over this time before the retraction."""
 GONE = 0.05
 """The contact is gone when the tension has fallen to this part of its peak."""
+
+
+class Glance(NamedTuple):
+    """A frame in seven numbers: means of force (N, untared) and pressure (Pa, or ``nan``), and the stage's position."""
+
+    number: int
+    start: int
+    stop: int
+    rate: float
+    force: float
+    pressure: float
+    position: float
+
+    @classmethod
+    def at(cls, frame: Frame) -> Glance:
+        """Reduce a frame."""
+        pressure = np.nan if frame.pressure is None else float(frame.pressure.mean())
+        force = float(frame.force.mean())
+        return cls(frame.number, frame.start, frame.stop, frame.rate, force, pressure, frame.stage.position)
 
 
 @dataclass(frozen=True)
@@ -83,22 +103,20 @@ class Gathering:
             elif event.name == "return":
                 self.gone = True
 
-    def frame(self, frame: Frame) -> None:
+    def add(self, glance: Glance) -> None:
         """Take in a frame."""
-        force = float(frame.force.mean())
-        position = frame.stage.position
         if self._step == "tare":
-            self._tare.append(force)
+            self._tare.append(glance.force)
         elif self._step in ("approach", "preload") and np.isnan(self._touch):
-            self._feel(force, position)
+            self._feel(glance.force, glance.position)
         elif self.retracting and not self.gone:
-            self._pull(frame, force, position)
-        if frame.pressure is not None and not self.retracting:
-            self._rest.append((frame.start, float(frame.pressure.mean())))
-            while self._rest[-1][0] - self._rest[0][0] > REST_S * frame.rate:
+            self._pull(glance)
+        if not np.isnan(glance.pressure) and not self.retracting:
+            self._rest.append((glance.stop, glance.pressure))
+            while self._rest[-1][0] - self._rest[0][0] > REST_S * glance.rate:
                 self._rest.popleft()
-        self._last_position = position
-        self._last = (frame.number, frame.stop)
+        self._last_position = glance.position
+        self._last = (glance.number, glance.stop)
 
     def _feel(self, force: float, position: float) -> None:
         if len(self._tare) < 2:
@@ -108,14 +126,13 @@ class Gathering:
         if abs(force - float(np.mean(self._tare))) > self._touch_level:
             self._touch = (position + self._last_position) / 2
 
-    def _pull(self, frame: Frame, force: float, position: float) -> None:
-        pressure = np.nan if frame.pressure is None else float(frame.pressure.mean())
-        tension = self.zero - force
+    def _pull(self, glance: Glance) -> None:
+        tension = self.zero - glance.force
         self._peak = max(self._peak, tension)
         if self._peak > 20 * TOUCH_N and tension < GONE * self._peak:
             self.gone = True
             return
-        self._rows.append(((position + self._last_position) / 2, force, pressure))
+        self._rows.append(((glance.position + self._last_position) / 2, glance.force, glance.pressure))
 
     @property
     def zero(self) -> float:
@@ -126,6 +143,11 @@ class Gathering:
     def height(self) -> float:
         """The stage's last position, m."""
         return self._last_position
+
+    @property
+    def frames(self) -> int:
+        """How many frames of the retraction there are."""
+        return len(self._rows)
 
     def evidence(self) -> Evidence:
         """Return what is known now."""

@@ -1,8 +1,8 @@
 """Estimate what a test is made of from its frames so far, and what that says of its end.
 
-Unknown are the height of the apex, the zero of the force, the stiffness of the film, the effective work of adhesion and
-the amount of gas. The cone model gives force and pressure at a height; Gauss-Newton steps find the most probable values,
-and their curvature the covariance. The model is not the specimen: what it lacks is a smooth unknown function of the
+Unknown are the height of the apex, the zero of the force, the stiffness of the film, the effective work of adhesion
+and the amount of gas. The cone model gives force and pressure at a height; Gauss-Newton steps find the most probable
+values, and their curvature the covariance. The model is not the specimen: what it lacks is an unknown function of the
 height (a Gaussian process) beside the sensors' noise, so that data never make the band narrower than the model deserves.
 
 The cone's known weakness, the distance under suction (EML 2020, section 5: 1.7 times too long on average), is mended by
@@ -68,14 +68,14 @@ class Doubt:
     stiffness: float = 0.10
     work_of_adhesion: float = 0.25
     gas: float = 300.0
-    force_shape: float = 0.10
+    force_shape: float = 0.13
     pressure_shape: float = 60.0
     correlation: float = 0.4
-    rough: float = 0.4
+    rough: float = 0.3
     rough_correlation: float = 0.08
-    curvature: float = 1.0
+    curvature: float = 2.0
     distance: float = 0.12
-    end: float = 0.04
+    end: float = 0.07
     unmended_distance: float = 0.3
 
 
@@ -337,7 +337,8 @@ class _Problem:
             if gain < 0.02:
                 break
         slopes, jacobian = self._slopes(values, residual, names)
-        return self._fit(values, np.linalg.inv(jacobian.T @ jacobian), curves, slopes)
+        covariance: Array = np.linalg.inv(jacobian.T @ jacobian)
+        return self._fit(values, covariance, curves, slopes)
 
     def _fit(self, values: dict[str, float], covariance: Array, curves: Curves, slopes: Slopes) -> Fit:
         force = self._force - values["force_zero"] - np.interp(self._height, curves.height, curves.force)

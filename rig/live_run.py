@@ -1,0 +1,203 @@
+"""Live prediction beside a run: an observer that watches frames and tells predictions, and never delays the loop.
+
+In virtual time a prediction is made on the loop's thread at fixed frames: the run's time stands still meanwhile, and
+runs stay identical. In real time a process of its own makes the next one as soon as the last is ready.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from collections.abc import Callable
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Protocol
+
+from model.parameters import Parameters
+from rig.live import UPDATES, LivePrediction, LivePredictor
+from rig.live_data import Gathering, Glance
+from rig.observe import Ending, StepEvent, StepPhase, Watcher
+from sequences.frame import Frame
+
+Tell = Callable[[LivePrediction, str], None]
+"""Takes a prediction and the form of it that a recording keeps."""
+
+
+class Maker(Protocol):
+    """Makes predictions out of steps and frames."""
+
+    def step(self, event: StepEvent) -> None:
+        """Take in a step."""
+        ...
+
+    def frame(self, glance: Glance) -> LivePrediction | None:
+        """Take in a frame; return a prediction when there is a new one."""
+        ...
+
+    def close(self) -> None:
+        """Give up what is held."""
+        ...
+
+
+class Live(Watcher):
+    """The observer. ``tell`` is called on the loop's thread (``Reporter.prediction``)."""
+
+    def __init__(self, maker: Maker, tell: Tell) -> None:
+        self._maker = maker
+        self._tell = tell
+
+    def step(self, event: StepEvent) -> None:
+        """Take in a step."""
+        if event.phase is StepPhase.STARTED:
+            self._maker.step(event)
+
+    def frame(self, frame: Frame) -> None:
+        """Take in a frame and tell a prediction if there is one."""
+        prediction = self._maker.frame(Glance.at(frame))
+        if prediction is not None:
+            self._tell(prediction, prediction.to_json())
+
+    def finished(self, ending: Ending) -> None:
+        """The run is over."""
+        self._maker.close()
+
+
+def live(parameters: Parameters, tell: Tell, *, virtual: bool, compliance: float = 0.0) -> Live:
+    """Return the observer for a scene: beside the loop in real time, at fixed frames in virtual time."""
+    maker = Inline(parameters, compliance) if virtual else Beside(parameters, compliance)
+    return Live(maker, tell)
+
+
+class _Schedule:
+    """A prediction is due at P_0, and whenever the stage has gone another part of the predicted way."""
+
+    def __init__(self) -> None:
+        self._next = -float("inf")
+
+    def due(self, gathering: Gathering) -> bool:
+        return gathering.retracting and not gathering.gone and gathering.frames > 0 and gathering.height >= self._next
+
+    def made(self, gathering: Gathering, prediction: LivePrediction | None) -> None:
+        way = 1e-3 if prediction is None else max(prediction.pull_off_distance.value, 1e-4)
+        self._next = gathering.height + way / UPDATES
+
+
+class Inline:
+    """Makes predictions on the caller's thread, at frames that depend on the data alone."""
+
+    def __init__(self, parameters: Parameters, compliance: float) -> None:
+        self._gathering = Gathering()
+        self._predictor = LivePredictor(parameters, compliance=compliance)
+        self._schedule = _Schedule()
+
+    def step(self, event: StepEvent) -> None:
+        """See ``Maker``."""
+        self._gathering.step(event)
+
+    def frame(self, glance: Glance) -> LivePrediction | None:
+        """See ``Maker``."""
+        self._gathering.add(glance)
+        if not self._schedule.due(self._gathering):
+            return None
+        prediction = self._predictor.predict(self._gathering.evidence())
+        self._schedule.made(self._gathering, prediction)
+        return prediction
+
+    def close(self) -> None:
+        """See ``Maker``."""
+
+
+class Beside:
+    """Makes predictions in a process of its own, of whatever has come when the last one is ready.
+
+    Each frame costs the caller one small write; the process empties its pipe at all times, so the write never waits.
+    """
+
+    def __init__(self, parameters: Parameters, compliance: float) -> None:
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_work, args=(theirs, parameters, compliance), daemon=True, name="live prediction"
+        )
+        self._process.start()
+        theirs.close()
+        self._lost = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether the process has died; the run goes on without predictions."""
+        return self._lost
+
+    def step(self, event: StepEvent) -> None:
+        """See ``Maker``."""
+        self._send({"step": event.name, "sample": event.sample})
+
+    def frame(self, glance: Glance) -> LivePrediction | None:
+        """See ``Maker``."""
+        self._send({"frame": glance})
+        try:
+            if self._lost or not self._pipe.poll():
+                return None
+            return LivePrediction.from_json(self._pipe.recv_bytes().decode())
+        except (EOFError, OSError):
+            self._lost = True
+            return None
+
+    def _send(self, message: object) -> None:
+        if self._lost:
+            return
+        try:
+            self._pipe.send_bytes(json.dumps(message).encode())
+        except OSError:
+            self._lost = True
+
+    def close(self) -> None:
+        """See ``Maker``."""
+        self._pipe.close()
+        self._process.join(2.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._process.close()
+
+
+def _work(pipe: Connection, parameters: Parameters, compliance: float) -> None:
+    """Read on one thread, predict on another: the pipe is empty even while a prediction takes its time."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is the run's business
+    gathering, schedule = Gathering(), _Schedule()
+    lock, news, over = threading.Lock(), threading.Event(), threading.Event()
+
+    def read() -> None:
+        try:
+            while True:
+                message = json.loads(pipe.recv_bytes())
+                with lock:
+                    if "step" in message:
+                        gathering.step(StepEvent(StepPhase.STARTED, message["step"], message["sample"]))
+                    else:
+                        gathering.add(Glance(*message["frame"]))
+                news.set()
+        except (EOFError, OSError):
+            over.set()
+            news.set()
+
+    threading.Thread(target=read, daemon=True, name="live frames").start()
+    predictor = LivePredictor(parameters, compliance=compliance)
+    while True:
+        news.wait()
+        news.clear()
+        if over.is_set():
+            return
+        with lock:
+            evidence = gathering.evidence() if schedule.due(gathering) else None
+        if evidence is None:
+            continue
+        prediction = predictor.predict(evidence)
+        with lock:
+            schedule.made(gathering, prediction)
+        if prediction is not None:
+            try:
+                pipe.send_bytes(prediction.to_json().encode())
+            except OSError:
+                return
