@@ -329,7 +329,7 @@ def test_a_server_that_dies_is_not_connected(world: SignalWorld) -> None:
 def test_a_server_that_hangs_does_not_hang_the_rig(
     server: EmulatedDaq, world: SignalWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drivers.daq, "_SLOWEST_ANSWER", 0.2)
+    monkeypatch.setattr(drivers.daq, "SLOWEST_ANSWER", 0.2)
     with connect(server, patience=0.05) as daq:
         world.faults.add(Fault("daq", "hang"))
         with pytest.raises(NoReply, match="DEADLINE_EXCEEDED"):

@@ -371,8 +371,8 @@ class DirectDaq:
 
 
 def _error_of(refusal: Refusal) -> DeviceError:
-    """The rig's error for a DAQmx error code, as ``drivers.daq`` maps it."""
-    from drivers.daq import DEVICE_GONE, NO_SUCH_DEVICE, SAMPLES_LOST
+    """The rig's error for a DAQmx error code, as ``drivers.daq_errors`` maps it."""
+    from drivers.daq_errors import DEVICE_GONE, NO_SUCH_DEVICE, SAMPLES_LOST
 
     message = f"DAQmx error {refusal.code}: {refusal}"
     if refusal.code in SAMPLES_LOST:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.calibration import Calibration
-from drivers.daq import BridgeChannel, Channel
+from drivers.daq_channels import BridgeChannel, Channel
 from drivers.emulated.faults import Faults
 from drivers.emulated.noise import NoiseStream
 
