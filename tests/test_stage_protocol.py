@@ -51,7 +51,10 @@ def test_another_device_is_refused(identity, error):
 
 
 def test_a_missing_axis_is_refused():
-    with dialogue([*CONNECT[:2], (b"SAI?\n", b"A \nB\n"), CONNECT[3]]) as url, pytest.raises(WrongDevice, match=r"\['A', 'B'\]"):
+    with (
+        dialogue([*CONNECT[:2], (b"SAI?\n", b"A \nB\n"), CONNECT[3]]) as url,
+        pytest.raises(WrongDevice, match=r"\['A', 'B'\]"),
+    ):
         PIStage(url)
 
 

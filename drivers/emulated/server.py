@@ -38,8 +38,10 @@ class Unplugged(Exception):
 class Session(Protocol):
     """One host's connection to an instrument."""
 
-    watch_interval: float | None
-    """How often ``watch`` wants to be called while the host is quiet, s; ``None`` is never."""
+    @property
+    def watch_interval(self) -> float | None:
+        """How often ``watch`` wants to be called while the host is quiet, s; ``None`` is never."""
+        ...
 
     def receive(self, data: bytes) -> None:
         """Act on bytes from the host. Raises ``Unplugged``."""
@@ -74,6 +76,7 @@ class Line:
         self._fragment = fragment
         self._waiting: queue.SimpleQueue[tuple[float, bytes] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
+        self._closed = threading.Event()
 
     def send(self, data: bytes, delay: float = 0.0) -> None:
         """Send now, or ``delay`` seconds from now; never before what was sent earlier."""
@@ -87,7 +90,7 @@ class Line:
 
     def close(self) -> None:
         """Drop what is waiting."""
-        self._write = _nowhere
+        self._closed.set()
         self._waiting.put(None)
 
     def _put(self, data: bytes) -> None:
@@ -100,7 +103,8 @@ class Line:
     def _send_waiting(self) -> None:
         while (item := self._waiting.get()) is not None:
             due, data = item
-            time.sleep(max(0.0, due - time.monotonic()))
+            if self._closed.wait(max(0.0, due - time.monotonic())):
+                return
             # A host that has left misses its reply; the instrument does not care.
             with contextlib.suppress(OSError):
                 self._put(data)
@@ -181,10 +185,6 @@ def scrambled(number: int, seed: int) -> int:
     return bits ^ (bits >> 31)
 
 
-def _nowhere(data: bytes) -> None:
-    raise ConnectionError("the line is closed")
-
-
 class Server:
     """A running server; a context manager.
 
@@ -201,10 +201,9 @@ class Server:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop serving and end every session."""
+        """Stop serving and end every session; a second call does nothing."""
         self._close()
-        if self._thread is not threading.current_thread():
-            self._thread.join()
+        self._thread.join()
 
     def __enter__(self) -> Self:
         return self
@@ -237,14 +236,22 @@ class _TcpServer:
         self._closing = False
 
     def serve(self) -> None:
+        try:
+            self._accept_hosts()
+        finally:
+            self._listener.close()
+            for thread, connection in self._sessions.items():
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+                thread.join()
+
+    def _accept_hosts(self) -> None:
         while True:
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
-                if self._closing:
-                    return
-                raise
-            if self._closing or not self._has_room():
+            connection, _ = self._listener.accept()
+            if self._closing:
+                connection.close()
+                return
+            if not self._has_room():
                 connection.close()
                 continue
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -253,15 +260,10 @@ class _TcpServer:
             thread.start()
 
     def close(self) -> None:
-        self._closing = True
-        # Closing a listener does not wake its accept everywhere; a connection does.
-        with contextlib.suppress(OSError):
-            socket.create_connection(self._listener.getsockname(), timeout=1.0).close()
-        self._listener.close()
-        for thread, connection in list(self._sessions.items()):
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-            thread.join()
+        """Wake the serving thread with a last connection; it ends the sessions."""
+        if not self._closing:
+            self._closing = True
+            socket.create_connection(self._listener.getsockname()).close()
 
     def _has_room(self) -> bool:
         """A host that reconnects at once finds its old session just ending."""

@@ -303,7 +303,7 @@ class EmulatedController:
         position, velocity = axis.position, axis.velocity
         pressed = (0b001 if position <= self._switches[0] else 0) | (0b100 if position >= self._switches[1] else 0)
         if fault := self._wire.fault("limit_switch"):
-            pressed |= self._pressed or (0b100 if (fault.value or velocity) > 0 else 0b001)
+            pressed |= self._pressed or (0b100 if (fault.value or axis.target - position) > 0 else 0b001)
         newly, self._pressed = pressed & ~self._pressed, pressed
         heads_in = (pressed & 0b001 and velocity < 0) or (pressed & 0b100 and velocity > 0)
         if (newly or heads_in) and axis.moving and not self._referencing:
