@@ -197,7 +197,20 @@ def find_jumps(values: Array, noise: Noise, width: int, smallest: float) -> list
         return []
     groups = np.split(flagged, np.flatnonzero(np.diff(flagged) > width) + 1)
     tested = (_test_jump(values, _centre(contrast, group), noise, width, smallest) for group in groups)
-    return [jump for jump in tested if jump is not None]
+    return [_sharpen(values, jump, noise, width, smallest) for jump in tested if jump is not None]
+
+
+def _sharpen(values: Array, jump: ForceJump, noise: Noise, width: int, smallest: float) -> ForceJump:
+    """Look at a jump ever closer while most of it remains: force that runs away before the snap is not part of it."""
+    while width >= 8:
+        width //= 2
+        change = np.abs(np.diff(running_mean(values[max(0, jump.start - 1) : jump.stop + 2], max(1, width // 8))))
+        centre = max(0, jump.start - 1) + int(np.argmax(change)) + 1
+        closer = _test_jump(values, centre, noise, width, smallest)
+        if closer is None or abs(closer.size) < 0.5 * abs(jump.size):
+            break
+        jump = closer
+    return jump
 
 
 def _centre(contrast: Array, group: NDArray[np.intp]) -> int:

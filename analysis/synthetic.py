@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
 from analysis.numerics import Array
 from analysis.run import Run, Sensors, Step
-from model.parameters import Parameters
+from model.jkr import jkr_curve
+from model.parameters import STANDARD_ATMOSPHERE, Parameters
 from model.prediction import Prediction
 
 
@@ -22,11 +24,20 @@ class Profile:
     pressure: Array
 
     @classmethod
-    def of(cls, prediction: Prediction) -> Profile:
-        """Take the stable part of a prediction."""
+    def of(cls, prediction: Prediction, compression: float = 0.4) -> Self:
+        """Take the stable part of a prediction, from where the compression has fallen to ``compression`` (N)."""
         order = np.flatnonzero(prediction.stable)
         keep = order[np.concatenate([[True], np.diff(np.maximum.accumulate(prediction.retraction[order])) > 0])]
+        keep = keep[int(np.argmax(prediction.force[keep] < compression)) :]
         return cls(prediction.retraction[keep], prediction.force[keep], prediction.pressure[keep])
+
+    @classmethod
+    def jkr(cls, work_of_adhesion: float, radius: float, modulus: float, preload: float, points: int = 4000) -> Self:
+        """Return the unloading of a JKR contact from ``preload`` (N); no pressure."""
+        hertz = float(np.cbrt(3 * preload * radius / (4 * modulus)))
+        curve = jkr_curve(work_of_adhesion, radius, modulus, largest_contact=3 * hertz, points=3 * points)
+        part = curve.force < preload
+        return cls(-curve.indentation[part], curve.force[part], np.zeros(int(part.sum())))
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,3 +263,42 @@ def _truth(profile: Profile, test: Experiment) -> dict[str, float]:
         "pressure_at_pull_off_Pa": float(profile.pressure[lowest]),
         "adhesion_energy_J": -float(np.trapezoid(pull, path)),
     }
+
+
+def volume_run(
+    volume: float,
+    *,
+    rate: float = 200.0,
+    pressure_noise: float = 10.0,
+    gain: float = 0.0,
+    offset: float = 0.0,
+    pump_gain: float = 0.0,
+    seed: int = 0,
+    sensors: Sensors | None = None,
+    parameters: Parameters | None = None,
+) -> Run:
+    """Make a run of the protocol ``volume``: the pump moves 0.3 ml out and in again, the chamber follows Boyle's law.
+
+    Parameters
+    ----------
+    volume
+        True V_0, m^3.
+    gain, offset, pump_gain
+        Errors of the pressure's sensitivity (relative), its zero (Pa) and the pump's volume (relative).
+    """
+    generator = np.random.default_rng(seed)
+    there = np.linspace(0.0, -0.3e-6, round(20 * rate))
+    moved = np.concatenate([there, there[::-1]])
+    gas = STANDARD_ATMOSPHERE * moved / (volume - moved)
+    return Run(
+        name=f"volume-{seed}",
+        protocol="volume",
+        rate=rate,
+        force=generator.normal(0, 1e-3, moved.size),
+        pressure=gas * (1 + gain) + offset + generator.normal(0, pressure_noise, moved.size),
+        height=np.zeros(moved.size),
+        steps=(Step("pump", 0, moved.size),),
+        parameters=parameters,
+        sensors=sensors or Sensors(),
+        pump_volume=moved * (1 + pump_gain),
+    )
