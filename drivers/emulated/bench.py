@@ -19,10 +19,15 @@ from drivers.interfaces import Clock
 if TYPE_CHECKING:
     from drivers.daq import Channel
     from drivers.emulated.acquisition import Pace
-    from drivers.emulated.direct import DirectDaq, DirectPump, DirectStage
+    from drivers.emulated.direct import DirectDaq, DirectStage
+    from drivers.emulated.direct_pump import DirectPump
     from drivers.emulated.electronics import Device
     from drivers.emulated.pump import EmulatedLegato
     from drivers.emulated.stage import EmulatedController
+
+
+SYRINGE, SYRINGE_FILL = 10e-6, 2e-6
+"""What the syringe holds, and what is in it at the start, m^3: most of its travel is for suction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +134,10 @@ class EmulatedBench:
 
     def pump(self, **options: Any) -> DirectPump:
         """Return the pump, straight on the plant; ``options`` as for ``DirectPump``."""
-        from drivers.emulated.direct import DirectPump
+        from drivers.emulated.direct_pump import DirectPump
 
         self._check_direct()
-        return DirectPump(self.plant, self.legato, clock=self.clock, **options)
+        return DirectPump(self.legato, clock=self.clock, **options)
 
     def daq(self, *channels: str | Channel, rate: float = 1000.0, **options: Any) -> DirectDaq:
         """Return a DAQ task, straight on the plant; ``options`` as for ``DirectDaq``.
@@ -185,7 +190,9 @@ class EmulatedBench:
         if self._legato is None:
             from drivers.emulated.pump import EmulatedLegato
 
-            self._legato = EmulatedLegato(self.plant, latency=self._latency)
+            self._legato = EmulatedLegato(
+                self.plant, latency=self._latency, capacity=SYRINGE, fill=SYRINGE_FILL, seed=self._seed
+            )
         return self._legato
 
     def step_started(self, name: str) -> None:

@@ -50,11 +50,11 @@ class Knot(NamedTuple):
     amount: float
     relaxed: float
     sensed: float
-    output: tuple[float, float, float]
+    output: Array
+    """Force, pressure, supply; shape (3, 1)."""
 
 
-SIGNALS = ("force", "pressure", "supply")
-"""Order of ``Knot.output``."""
+SIGNALS = 3
 
 
 class Plant:
@@ -88,6 +88,7 @@ class Plant:
         self._epoch = 0.0
         self._epoch_sample = 0
         self._step = LONGEST_STEP
+        self._ones = np.arange(0)
         self._knots: list[Knot] = []
         self._carriage = Carriage(self._now, truth.train.start_position, truth.train.servo_lag, self._settle)
         self._plunger = Plunger(self._now, truth.chamber.syringe_diameter, self._pressure, self._settle)
@@ -139,34 +140,36 @@ class Plant:
             if rate != self._rate:
                 self._rate, self._epoch, self._epoch_sample = rate, self._time, self._sample
             start, stop = self._sample, self._sample + samples
-            first = start - self._epoch_sample + 1
-            times = self._epoch + np.arange(first, first + samples) / rate
+            times = self._epoch + (self._counting(samples) + (start - self._epoch_sample)) / rate
             if samples:
-                self._extend(end := float(times[-1]))
-                self._time = end
+                self._time = float(times[-1])
                 self._sample = stop
+                self._extend(self._time)
             self.faults.advance(stop)
-            outputs = self._between_knots(times) + self._noise.take(start, stop)
+            force, pressure, supply = self._between_knots(times) + self._noise.take(start, stop)
             self._forget()
-            return dict(zip(SIGNALS, outputs, strict=True))
+            return {"force": force, "pressure": pressure, "supply": supply}
+
+    def _counting(self, samples: int) -> NDArray[np.int64]:
+        """1, 2, ... samples; frames are mostly of one length."""
+        if self._ones.size != samples:
+            self._ones = np.arange(1, samples + 1)
+        return self._ones
 
     def _between_knots(self, times: Array) -> Array:
         """Straight lines between the knots at the given times, shape (signals, times)."""
-        knots = self._knots
-        pieces = []
+        pieces = [np.empty((SIGNALS, 0))]
         done = 0
-        for before, after in itertools.pairwise(knots):
+        for before, after in itertools.pairwise(self._knots):
             if done == times.size:
                 break
-            upto = times.size if times[-1] <= after.time else int(np.searchsorted(times, after.time, side="right"))
-            if upto > done:
-                part = times[done:upto] - before.time
-                duration = after.time - before.time
-                lines = zip(before.output, after.output, strict=True)
-                slopes = np.array([[(end - start) / duration] for start, end in lines])
-                pieces.append(slopes * part + np.array(before.output)[:, None])
-                done = upto
-        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces or [np.empty((len(SIGNALS), 0))], axis=1)
+            end = after.time + ROUND_OFF
+            stop = times.size if times[-1] <= end else int(np.searchsorted(times, end, side="right"))
+            if stop > done:
+                slopes = (after.output - before.output) / (after.time - before.time)
+                pieces.append(slopes * (times[done:stop] - before.time) + before.output)
+                done = stop
+        return pieces[1] if len(pieces) == 2 else np.concatenate(pieces, axis=1)
 
     def _now(self) -> float:
         return self._time
@@ -180,7 +183,7 @@ class Plant:
 
     def _extend(self, until: float) -> None:
         """Compute the world up to ``until``, and to the end of the step that reaches it."""
-        while self._knots[-1].time < until:
+        while self._knots[-1].time < until - ROUND_OFF:
             self._take_step()
 
     def _take_step(self) -> None:
@@ -209,20 +212,20 @@ class Plant:
     def _knot(self, time: float, state: State, amount: float, relaxed: float, sensed: float) -> Knot:
         """Add to a state what the sensors make of it."""
         output = (
-            state.force - self.truth.train.relaxing * relaxed + self._force_drift.at(time),
-            sensed + self._pressure_drift.at(time),
-            self.truth.disturbance.supply + self._supply_drift.at(time),
+            (state.force - self.truth.train.relaxing * relaxed + self._force_drift.at(time),),
+            (sensed + self._pressure_drift.at(time),),
+            (self.truth.disturbance.supply + self._supply_drift.at(time),),
         )
-        return Knot(time, state, amount, relaxed, sensed, output)
+        return Knot(time, state, amount, relaxed, sensed, np.array(output))
 
     def _settle(self) -> None:
         """Make now a knot and forget what was computed beyond: a command is about to change the future."""
         self._extend(self._time)
         knots = self._knots
-        while knots[-1].time > self._time:
+        while knots[-1].time > self._time + ROUND_OFF:
             knots.pop()
         last = knots[-1]
-        if self._time - last.time < ROUND_OFF:
+        if abs(self._time - last.time) < ROUND_OFF:
             knots[-1] = last._replace(time=self._time)
         else:
             knots.append(self._after(last, self._time))
