@@ -141,13 +141,18 @@ class LivePredictor:
         Of the load train, m/N.
     doubt
         What is not known beforehand; the default is calibrated, see ``docs/console.md``.
+    model
+        Name of the model; the cone is mended by one solution of the exact membrane.
     """
 
-    def __init__(self, parameters: Parameters, *, compliance: float = 0.0, doubt: Doubt | None = None) -> None:
+    def __init__(
+        self, parameters: Parameters, *, compliance: float = 0.0, doubt: Doubt | None = None, model: str = "cone"
+    ) -> None:
         from rig.live_fit import Doubt, Estimator
 
         self._doubt = doubt or Doubt()
-        self._estimator: Estimator = Estimator(parameters, self._doubt, compliance)
+        self._estimator: Estimator = Estimator(parameters, self._doubt, compliance, model)
+        self._model = model
         self._nominal_work = parameters.membrane.work_of_adhesion
         self._values: Mapping[str, float] | None = None
         self._last: LivePrediction | None = None
@@ -165,7 +170,7 @@ class LivePredictor:
 
         began = time.perf_counter()
         try:
-            if self._last is None:
+            if self._last is None and self._model == "cone":
                 middle = {name: value for name, (value, _) in self._estimator.prior(evidence).items()}
                 self._estimator.mend = mend(self._estimator.changed(middle))
             fit = self._estimator.fit(evidence, self._values)

@@ -2,8 +2,9 @@
 
 Unknown are the height of the apex, the zero of the force, the stiffness of the film, the effective work of adhesion
 and the amount of gas. The cone model gives force and pressure at a height; Gauss-Newton steps find the most probable
-values, and their curvature the covariance. The model is not the specimen: what it lacks is an unknown function of the
-height (a Gaussian process) beside the sensors' noise, so that data never make the band narrower than the model deserves.
+values, and their curvature the covariance. The model is not the specimen: what it lacks is an unknown function of
+height (a Gaussian process) beside the sensors' noise, so that no amount of data makes the band
+narrower than the model deserves.
 
 The cone's known weakness, the distance under suction (EML 2020, section 5: 1.7 times too long on average), is mended by
 one solution of the exact membrane at the measured P_0: behind the onset of peeling the cone's curve is stretched to it.
@@ -174,10 +175,13 @@ class Estimator:
         The scene's.
     compliance
         Of the load train, m/N.
+    model
+        Name of the model.
     """
 
-    def __init__(self, parameters: Parameters, doubt: Doubt, compliance: float) -> None:
+    def __init__(self, parameters: Parameters, doubt: Doubt, compliance: float, model: str) -> None:
         self._parameters = parameters
+        self._model = model
         self._doubt = doubt
         self._compliance = compliance
         self.mend = Mend()
@@ -192,7 +196,7 @@ class Estimator:
         NoFit
             There is no pull-off at these values.
         """
-        found = predict(self.changed(values), points=80)
+        found = predict(self.changed(values), self._model, points=80)
         if found.outcome is not Outcome.PULL_OFF:
             raise NoFit(f"live prediction: {found.outcome}")
         stretched, mended = self.mend.distance, self.mend.force
@@ -337,8 +341,7 @@ class _Problem:
             if gain < 0.02:
                 break
         slopes, jacobian = self._slopes(values, residual, names)
-        covariance: Array = np.linalg.inv(jacobian.T @ jacobian)
-        return self._fit(values, covariance, curves, slopes)
+        return self._fit(values, np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64), curves, slopes)
 
     def _fit(self, values: dict[str, float], covariance: Array, curves: Curves, slopes: Slopes) -> Fit:
         force = self._force - values["force_zero"] - np.interp(self._height, curves.height, curves.force)

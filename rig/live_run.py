@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import signal
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Protocol
@@ -64,9 +65,24 @@ class Live(Watcher):
 
 
 def live(parameters: Parameters, tell: Tell, *, virtual: bool, compliance: float = 0.0) -> Live:
-    """Return the observer for a scene: beside the loop in real time, at fixed frames in virtual time."""
+    """Return the observer for a run: beside the loop in real time, at fixed frames in virtual time."""
     maker = Inline(parameters, compliance) if virtual else Beside(parameters, compliance)
     return Live(maker, tell)
+
+
+def live_again(
+    parameters: Parameters, tell: Tell, recorded: Sequence[tuple[int, str]], *, compliance: float = 0.0
+) -> Live:
+    """Return the observer for a replay: it makes every recorded prediction (sample, JSON) again, from the same frames.
+
+    It tells each at the sample it was told at, so that the operator sees what was seen.
+    """
+    return Live(Again(parameters, compliance, recorded), tell)
+
+
+def live_what_if(parameters: Parameters, tell: Tell, *, model: str = "cone", compliance: float = 0.0) -> Live:
+    """Return the observer for a replay that asks what another model or other values would have said."""
+    return Live(Inline(parameters, compliance, model), tell)
 
 
 class _Schedule:
@@ -86,9 +102,9 @@ class _Schedule:
 class Inline:
     """Makes predictions on the caller's thread, at frames that depend on the data alone."""
 
-    def __init__(self, parameters: Parameters, compliance: float) -> None:
+    def __init__(self, parameters: Parameters, compliance: float, model: str = "cone") -> None:
         self._gathering = Gathering()
-        self._predictor = LivePredictor(parameters, compliance=compliance)
+        self._predictor = LivePredictor(parameters, compliance=compliance, model=model)
         self._schedule = _Schedule()
 
     def step(self, event: StepEvent) -> None:
@@ -103,6 +119,35 @@ class Inline:
         prediction = self._predictor.predict(self._gathering.evidence())
         self._schedule.made(self._gathering, prediction)
         return prediction
+
+    def close(self) -> None:
+        """See ``Maker``."""
+
+
+class Again:
+    """Makes recorded predictions again: from the frames each one names, told when it was told."""
+
+    def __init__(self, parameters: Parameters, compliance: float, recorded: Sequence[tuple[int, str]]) -> None:
+        self._gathering = Gathering()
+        self._predictor = LivePredictor(parameters, compliance=compliance)
+        self._told = [sample for sample, _ in recorded]
+        self._frames = [int(json.loads(text)["frame"]) for _, text in recorded]
+        self._made: deque[LivePrediction | None] = deque()
+
+    def step(self, event: StepEvent) -> None:
+        """See ``Maker``."""
+        self._gathering.step(event)
+
+    def frame(self, glance: Glance) -> LivePrediction | None:
+        """See ``Maker``."""
+        self._gathering.add(glance)
+        if self._frames and glance.number >= self._frames[0]:
+            self._frames.pop(0)
+            self._made.append(self._predictor.predict(self._gathering.evidence()))
+        if self._made and glance.stop >= self._told[0]:
+            self._told.pop(0)
+            return self._made.popleft()
+        return None
 
     def close(self) -> None:
         """See ``Maker``."""

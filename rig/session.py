@@ -8,7 +8,7 @@ import platform
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -108,7 +108,14 @@ def _leave(opened: Opened) -> None:
 
 
 def _recorded(request: Request, opened: Opened) -> Ending:
-    reporter = Reporter(observers := list(request.observers) + opened.observers)
+    observers = [*request.observers, *opened.observers]
+
+    def tell(prediction: Any, text: str) -> None:
+        reporter.prediction(prediction, text)
+
+    if request.live and request.scene.protocol.name == "pull_off":
+        observers.append(_live(request, opened, tell))
+    reporter = Reporter(observers)
     stage = CommandedStage(opened.stage, lambda text: reporter.event("command", text))
     pump = None if opened.pump is None else CommandedPump(opened.pump, lambda text: reporter.event("command", text))
     apparatus = Apparatus(stage, pump, reporter, request.bench.limits.look_ahead_um * 1e-6)
@@ -127,6 +134,13 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     for observer in observers:
         observer.finished(ending)
     return ending
+
+
+def _live(request: Request, opened: Opened, tell: Callable[[Any, str], None]) -> Observer:
+    from rig.live_run import live
+
+    compliance = request.bench.force.compliance_um_per_N * 1e-6
+    return live(request.scene.parameters(), tell, virtual=opened.virtual, compliance=compliance)
 
 
 def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
