@@ -30,17 +30,22 @@ class MemoryPort:
         except Unplugged as error:
             raise ConnectionError("the cable is out") from error
 
-    def read_until(self, end: bytes, longest: int) -> bytes:
-        """Take the bytes up to and with ``end``, or all there are."""
-        found = self._received.find(end)
-        stop = min(len(self._received) if found < 0 else found + len(end), longest)
-        taken = bytes(self._received[:stop])
-        del self._received[:stop]
+    @property
+    def in_waiting(self) -> int:
+        """How many bytes wait to be read."""
+        return len(self._received)
+
+    def read(self, size: int = 1) -> bytes:
+        """Take as many bytes, or all there are."""
+        taken = bytes(self._received[:size])
+        del self._received[:size]
         return taken
 
-    def reset_input_buffer(self) -> None:
-        """Drop what has not been read."""
-        self._received.clear()
+    def read_until(self, expected: bytes = b"\n", size: int | None = None) -> bytes:
+        """Take the bytes up to and with ``expected``, or all there are."""
+        found = self._received.find(expected)
+        stop = len(self._received) if found < 0 else found + len(expected)
+        return self.read(stop if size is None else min(stop, size))
 
     def close(self) -> None:
         """Nothing to release."""
