@@ -93,7 +93,9 @@ class _SerialPort:
                 return data
 
     def drain(self) -> None:
-        self._port.reset_input_buffer()
+        # Not reset_input_buffer: on a lost terminal that raises termios.error, which is no OSError.
+        while self._port.in_waiting:
+            self._port.read(self._port.in_waiting)
 
     def close(self) -> None:
         self._port.close()

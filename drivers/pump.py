@@ -473,7 +473,9 @@ class LegatoPump:
         with self._writing:
             self._awaited.clear()
         try:
-            self._port.reset_input_buffer()
+            # Not reset_input_buffer: on a lost terminal that raises termios.error, which is no OSError.
+            while self._port.in_waiting:
+                self._port.read(self._port.in_waiting)
         except OSError as error:
             raise self._lost("ver", error) from error
         landmark = self._send("", "poll on", "ver")

@@ -168,8 +168,7 @@ class PIStage:
         Without limit switches the reference switch is sought, in a direction the controller chooses.
         """
         self.servo(True)
-        with self._exchange("start the reference move"):
-            self._refuse_if_stopped()
+        with self._exchange("start the reference move"), self._unless_stopped():
             self._was_referenced = False
             self._fault = NO_ERROR
             self._gcs.RON(self._axis, 1)
@@ -179,7 +178,6 @@ class PIStage:
                 self._gcs.FPL(self._axis)
             else:
                 self._gcs.FNL(self._axis)
-        self._stop_again_if_pressed()
 
     def servo(self, on: bool) -> None:
         """Switch the servo."""
@@ -237,12 +235,10 @@ class PIStage:
                 f"target {position * 1e3:.6g} mm lies outside the travel {low * 1e3:.6g} .. {high * 1e3:.6g} mm",
                 "choose a target within the travel, or widen the limits in the bench file",
             )
-        with self._exchange(f"move to {position * 1e3:.6g} mm"):
-            self._refuse_if_stopped()
+        with self._exchange(f"move to {position * 1e3:.6g} mm"), self._unless_stopped():
             self._limits_accepted = self._limits_seen
             self._fault = NO_ERROR
             self._gcs.MOV(self._axis, position / self._direction)
-        self._stop_again_if_pressed()
 
     def stop(self) -> None:
         """Halt with the controller's deceleration and clear the 'stopped' error it leaves.
@@ -390,15 +386,17 @@ class PIStage:
     def _stop_was_pressed() -> MotionFault:
         return MotionFault(DEVICE, "the emergency stop was pressed", "call stop() to acknowledge it, then move")
 
-    def _refuse_if_stopped(self) -> None:
+    @contextlib.contextmanager
+    def _unless_stopped(self) -> Iterator[None]:
+        """Refuse a move after an emergency stop; stop again behind a move that the stop has overtaken."""
         if self._stop_pressed.is_set():
             raise self._stop_was_pressed()
-
-    def _stop_again_if_pressed(self) -> None:
-        """Close the gap in which a stop could have overtaken the move just sent."""
-        if self._stop_pressed.is_set():
-            self._send_urgent(STOP_EVERYTHING)
-            self._refuse_if_stopped()
+        try:
+            yield
+        finally:
+            if self._stop_pressed.is_set():
+                self._send_urgent(STOP_EVERYTHING)
+                raise self._stop_was_pressed()
 
     def _send_urgent(self, data: bytes) -> None:
         try:
