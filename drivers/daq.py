@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from drivers.daq_channels import BridgeChannel, Channel, VoltageChannel
+from drivers.daq_channels import BridgeChannel, Channel, VoltageChannel, signal_channel
 from drivers.daq_connection import SLOWEST_ANSWER, Deadline, connect
 from drivers.daq_errors import TIMED_OUT, translated
 from drivers.errors import BadReply, CommandRefused, DataLost, NoReply, NotConnected, WrongDevice
 from drivers.interfaces import Identity, Volts
 
-__all__ = ["BridgeChannel", "Channel", "NIDaq", "VoltageChannel"]
+__all__ = ["BridgeChannel", "Channel", "NIDaq", "VoltageChannel", "signal_channel"]
 
 _FILTER_DELAYS: dict[str, Callable[[float], float]] = {
     # NI 9237 operating instructions: input delay of the delta-sigma filter.

@@ -127,6 +127,18 @@ class BridgeChannel:
 
 Channel = VoltageChannel | BridgeChannel
 
+_HALF_SPANS = {"force": 10.0, "pressure": 5.0, "supply": 10.0}
+
+
+def signal_channel(name: str, physical: str, terminal: Terminal = "default") -> VoltageChannel:
+    """Return a channel in the range its signal needs, V.
+
+    +-5 V holds the HSC's output, and its converter noise is small enough to tell a live sensor from an open wire;
+    the supply may be 5.25 V and needs the next range.
+    """
+    half_span = _HALF_SPANS[name]
+    return VoltageChannel(name, physical, -half_span, half_span, terminal)
+
 
 def _check_channel(channel: Channel) -> None:
     if channel.name not in NAMES:

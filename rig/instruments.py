@@ -157,7 +157,7 @@ def open_pump(bench: Bench, clock: Clock = time.perf_counter, connections: dict[
 
 def open_daq(bench: Bench, pressure: bool, connections: dict[str, str] | None = None) -> Daq:
     """Open one task with the channels the scene needs; sampling has not begun."""
-    from drivers.daq import BridgeChannel, Channel, NIDaq, VoltageChannel
+    from drivers.daq import BridgeChannel, Channel, NIDaq, VoltageChannel, signal_channel
 
     part = bench.force
     channels: list[Channel] = []
@@ -179,7 +179,7 @@ def open_daq(bench: Bench, pressure: bool, connections: dict[str, str] | None = 
             ("pressure", bench.pressure.signal_channel),
             ("supply", bench.pressure.supply_channel),
         ):
-            channels.append(VoltageChannel(name, physical, -10.0, 10.0, bench.pressure.terminal))
+            channels.append(signal_channel(name, physical, bench.pressure.terminal))
     return NIDaq(
         channels,
         rate=bench.daq.rate_Hz,

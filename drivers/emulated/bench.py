@@ -17,7 +17,7 @@ from drivers.emulated.truth import Truth
 from drivers.interfaces import Clock
 
 if TYPE_CHECKING:
-    from drivers.daq import Channel
+    from drivers.daq_channels import Channel
     from drivers.emulated.acquisition import Pace
     from drivers.emulated.direct import DirectDaq, DirectStage
     from drivers.emulated.direct_pump import DirectPump
@@ -142,7 +142,7 @@ class EmulatedBench:
     def daq(self, *channels: str | Channel, rate: float = 1000.0, **options: Any) -> DirectDaq:
         """Return a DAQ task, straight on the plant; ``options`` as for ``DirectDaq``.
 
-        A channel may be given by its name alone: then it is the +-10 V input that the signal is wired to.
+        A channel may be given by its name alone: then it is the input its signal is wired to, in that signal's range.
         """
         from drivers.emulated.direct import DirectDaq
 
@@ -234,10 +234,11 @@ class EmulatedBench:
         return self._pace
 
     def _channel(self, name: str) -> Channel:
-        from drivers.daq import VoltageChannel
+
+        from drivers.daq_channels import signal_channel
 
         physical = {signal: terminal for terminal, signal in self.device.wiring.items()}
-        return VoltageChannel(name, physical[name])
+        return signal_channel(name, physical[name])
 
     def _check_direct(self) -> None:
         if self._wire:
