@@ -79,6 +79,10 @@ class Reporter:
         self._frames = 0
         self.sample = 0
 
+    def add(self, observer: Observer) -> None:
+        """Tell one more observer from now on."""
+        self._observers.append(observer)
+
     @property
     def step(self) -> str:
         """Name of the step under way."""

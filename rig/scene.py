@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -144,9 +144,16 @@ def load_scene(path: Path) -> Scene:
 def parse_scene(text: str, source: str) -> Scene:
     """Check the text of a scene file; ``source`` names it in messages."""
     try:
-        return Scene.model_validate(tomllib.loads(text))
+        content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"scene {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
+    return validate_scene(content, source)
+
+
+def validate_scene(content: dict[str, Any], source: str) -> Scene:
+    """Check the content of a scene file; ``source`` names it in messages."""
+    try:
+        return Scene.model_validate(content)
     except ValidationError as error:
         raise FileError(explain("scene", source, error, Scene)) from error
 

@@ -8,7 +8,7 @@ import platform
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -108,14 +108,7 @@ def _leave(opened: Opened) -> None:
 
 
 def _recorded(request: Request, opened: Opened) -> Ending:
-    observers = [*request.observers, *opened.observers]
-
-    def tell(prediction: Any, text: str) -> None:
-        reporter.prediction(prediction, text)
-
-    if request.live and request.scene.protocol.name == "pull_off":
-        observers.append(_live(request, opened, tell))
-    reporter = Reporter(observers)
+    reporter = Reporter([*request.observers, *opened.observers])
     stage = CommandedStage(opened.stage, lambda text: reporter.event("command", text))
     pump = None if opened.pump is None else CommandedPump(opened.pump, lambda text: reporter.event("command", text))
     apparatus = Apparatus(stage, pump, reporter, request.bench.limits.look_ahead_um * 1e-6)
@@ -123,6 +116,8 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     info = _info(request, opened, steps)
     recorder = Recorder(request.out, info, opened.daq.channels, _metadata(request))
     reporter.store = recorder
+    if request.live:
+        add_live_prediction(reporter, request.scene, request.bench, virtual=opened.virtual)
     ending = Ending("failed before the first frame", 1, 0)
     loop = _loop(request, opened, Instruments(stage, pump, opened.daq, opened.clock), reporter, recorder)
     try:
@@ -131,16 +126,19 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     finally:
         failures = make_safe(stage, pump, opened.daq)
         ending = _finish(recorder, reporter, ending, failures, loop.samples)
-    for observer in observers:
-        observer.finished(ending)
+    reporter.store = None  # closed
+    reporter.notify("finished", ending)
     return ending
 
 
-def _live(request: Request, opened: Opened, tell: Callable[[Any, str], None]) -> Observer:
+def add_live_prediction(reporter: Reporter, scene: Scene, bench: Bench, *, virtual: bool) -> None:
+    """Predict live where the papers have a model: pull-off with the rigid gripper."""
+    if scene.protocol.name != "pull_off" or scene.gripper.kind != "rigid":
+        return
     from rig.live_run import live
 
-    compliance = request.bench.force.compliance_um_per_N * 1e-6
-    return live(request.scene.parameters(), tell, virtual=opened.virtual, compliance=compliance)
+    compliance = bench.force.compliance_um_per_N * 1e-6
+    reporter.add(live(scene.parameters(), reporter.prediction, virtual=virtual, compliance=compliance))
 
 
 def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:

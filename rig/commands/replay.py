@@ -11,7 +11,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="recording")
     parser.add_argument("--speed", default="max", help="times real time, or max (default)")
     parser.add_argument("--verify", action="store_true", help="demand every derived value identical to the bit")
-    parser.add_argument("--model", help="what if: live prediction by another model")
+    parser.add_argument("--model", choices=("cone", "cone-2017", "membrane"), help="what if: predict with this model")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="what if: another scene value")
     parser.add_argument("--console", action="store_true", help="watch the replay in the console's window")
     parser.add_argument("--link", action="store_true", help="let consoles attach")
@@ -24,10 +24,11 @@ def run(arguments: argparse.Namespace) -> int:
     import sys
     import time
 
-    from rig.commands.run import _speed
+    from rig.commands.run import parse_speed
+    from rig.observe import Controls, Observer
     from rig.recording import load_recording
     from rig.replay import Pace
-    from rig.replay_session import replay
+    from rig.replay_session import replay, what_if
     from rig.terminal import Terminal
 
     if arguments.console:
@@ -35,18 +36,28 @@ def run(arguments: argparse.Namespace) -> int:
 
         return console.replay_with_console(arguments)
     recording = load_recording(arguments.file)
+    speed = parse_speed(arguments.speed)
+    controls = Controls()
+    observers: list[Observer] = [] if arguments.verify else [Terminal()]
+    server = None
+    if arguments.link:
+        from rig.link import LinkServer
+
+        server = LinkServer(controls)
+        observers.append(server)
     began = time.perf_counter()
-    speed = _speed(arguments.speed)
-    observers = [] if arguments.verify else [Terminal()]
-    outcome = replay(
-        recording,
-        pace=Pace(math.inf if speed is None else speed),
-        observers=observers,
-        link=arguments.link,
-        live=not arguments.no_live,
-        model=arguments.model,
-        changes=arguments.set,
-    )
+    try:
+        outcome = replay(
+            recording,
+            pace=Pace(math.inf if speed is None else speed),
+            observers=observers,
+            controls=controls,
+            live=not arguments.no_live,
+            what_if=what_if(recording, arguments.model, arguments.set),
+        )
+    finally:
+        if server is not None:
+            server.close()
     wall = time.perf_counter() - began
     seconds = recording.force.size / recording.rate
     print(f"{arguments.file}: {seconds:.1f} s replayed in {wall:.2f} s ({seconds / wall:.0f} times real time)")

@@ -62,7 +62,7 @@ def _request(arguments: argparse.Namespace, repeat: int) -> Request:
         bench_text=bench_text,
         out=_destination(arguments, Path(source).stem, repeat),
         seed=arguments.seed + repeat - 1,
-        speed=_speed(arguments.speed),
+        speed=parse_speed(arguments.speed),
         wire=not arguments.direct,
         repeat=repeat,
         repeats=max(1, arguments.repeat),
@@ -74,7 +74,8 @@ def _request(arguments: argparse.Namespace, repeat: int) -> Request:
     return request
 
 
-def _speed(text: str) -> float | None:
+def parse_speed(text: str) -> float | None:
+    """Return times real time, or ``None`` for ``max``."""
     from rig.errors import FileError
 
     if text == "max":
