@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from model.cone_branch import Branch, Point, largest_slope
+from model.cone_branch import Branch, Point, settled_state
 from model.cone_error import of_features
 from model.cone_path import Path, strongest_pull, trace, zero_of_force
 from model.cone_terms import Cone, Driven, Gas, Isothermal, Number, Vented
@@ -210,12 +210,8 @@ def sample(branch: Branch, path: Path, marks: tuple[Point, ...], points: int) ->
             for stretch in stretches
         ]
     )
-    start = branch.guess(radius)
-    inner = radius > 0
-    free_edge = cone.edge(np.where(inner, radius, branch.radius[-2]))
-    free_t = np.where(inner, largest_slope(cone, free_edge, start), branch.t[-1])
     free_edge = cone.edge(radius)
-    state = cone.state(free_edge, free_t)
+    state, free_t = settled_state(cone, free_edge, branch.guess(radius))
     return Profile(
         np.concatenate((edge.radius, radius)),
         np.concatenate((held_position, cone.position(free_edge, free_t))),

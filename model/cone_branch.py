@@ -21,7 +21,10 @@ from model.roots import EPSILON, bracketed
 ITERATIONS = 200
 FREE_STEPS = 16
 QUADRATIC = 1e-9
-"""A Newton step this small, and a thousand times smaller than the last, leaves an error below rounding."""
+"""A Newton step this small, and much smaller than the last, leaves an error below rounding."""
+COARSE = 1e-5
+SETTLED = 3e-7
+"""A Newton step this small leaves an error below 1e-12."""
 NOISE = 1e-9
 """Steps below this that no longer shrink are rounding noise; the error estimate says how much of it there is."""
 
@@ -58,34 +61,48 @@ def _balance(edge: Edge, lever: Number) -> Array:
     return result
 
 
-def largest_slope(cone: Cone, edge: Edge, start: Array | None = None) -> Array:
+def largest_slope(cone: Cone, edge: Edge, accuracy: float = QUADRATIC) -> Array:
     """Return the largest root t of dPi/drho = 0 for an array of contact radii.
 
-    Newton's method from ``start`` or from the upper bound; kept inside its bracket if free steps lead astray.
+    Newton's method from the upper bound; kept inside its bracket if free steps lead astray. With ``accuracy`` the
+    last step may be as large as that times t: one more step, taken with the derivatives, squares it.
     """
-    low, high = bounds(cone, edge)
-    if start is None:
-        start, low, high = _cold_start(cone, edge, low, high)
     with np.errstate(all="ignore"):
-        free = _free_newton(cone, edge, start)
+        low, high = bounds(cone, edge)
+        start, low, high = _cold_start(cone, edge, low, high)
+        free = _free_newton(cone, edge, start, accuracy)
         if free is not None and ((free >= low) & (free <= high)).all():
             return free
         return _bracketed_newton(cone, edge, np.clip(start, low, high), low, high)
 
 
-def _free_newton(cone: Cone, edge: Edge, t: Array) -> Array | None:
+def _free_newton(cone: Cone, edge: Edge, t: Array, accuracy: float) -> Array | None:
     """Return the root, or None unless every element converged quadratically on a rising residual."""
     previous: Array | float = 0.0
+    ratio = math.sqrt(accuracy)
     for _ in range(FREE_STEPS):
         value, slope = cone.residual(edge, t)
         step = value / slope
         t = t - step
         step = np.abs(step)
         scale = np.abs(t) + edge.slope
-        if ((step <= 8 * EPSILON * scale) | ((step <= QUADRATIC * scale) & (step <= 1e-3 * previous))).all():
+        if ((step <= 8 * EPSILON * scale) | ((step <= accuracy * scale) & (step <= ratio * previous))).all():
             return t if (slope > 0).all() else None
         previous = step
     return None
+
+
+def settled_state(cone: Cone, edge: Edge, t: Array) -> tuple[State, Array]:
+    """Return state and t from a close start: the last Newton step corrects the force to first order."""
+    with np.errstate(all="ignore"):
+        for _ in range(5):
+            state = cone.state(edge, t)
+            step = np.where(state.residual == 0, 0.0, state.residual / state.residual_t)
+            t = t - step
+            if (np.abs(step) <= SETTLED * (np.abs(t) + edge.slope)).all() and (t + edge.slope >= 0).all():
+                return state._replace(force=state.force - state.force_t * step), t
+    t = largest_slope(cone, edge)
+    return cone.state(edge, t), t
 
 
 def _bracketed_newton(cone: Cone, edge: Edge, t: Array, low: Array, high: Array) -> Array:
@@ -118,7 +135,7 @@ def _cold_start(cone: Cone, edge: Edge, low: Array, high: Array) -> tuple[Array,
         value, _ = cone.residual(edge, np.where(reaches, 0.0, high))
         cubic = -np.cbrt(value / (4 * (1 + edge.radius) * edge.slope))
     below = reaches & (value > 0)
-    start = np.where(below, np.maximum(cubic, low / 2), high)
+    start = np.where(below, np.maximum(cubic, low / 2), np.where(reaches, np.minimum(cubic, high), high))
     return start, np.where(reaches & ~below, 0.0, low), np.where(below, 0.0, high)
 
 
@@ -167,9 +184,11 @@ class Branch:
         half = np.sin(np.linspace(np.pi / 2, 0.0, nodes + 1)[:-1]) ** 2
         self.radius = cone.start_radius * half
         self.edge = cone.edge(self.radius)
-        self.t = largest_slope(cone, self.edge)
-        state = cone.state(self.edge, self.t)
-        self.force = state.force
+        t = largest_slope(cone, self.edge, COARSE)
+        state = cone.state(self.edge, t)
+        step = np.where(state.residual == 0, 0.0, state.residual / np.where(state.residual == 0, 1.0, state.residual_t))
+        self.t = t - step
+        self.force = state.force - state.force_t * step
         tilt = tilts(state)
         self.position = cone.position(self.edge, self.t)
         self.climb = -(self.t + self.edge.slope) - self.edge.gap * tilt
@@ -177,6 +196,7 @@ class Branch:
         self.slope = -tilt
         self._append_centre()
         self._last = (float(self.radius[0]), float(self.t[0]), float(self.slope[0]))
+        self.onset = self.point(float(self.radius[0]))
 
     def _append_centre(self) -> None:
         """Add the limit r -> 0: the cone of an inflated membrane touching the apex, or no contact at z = 0."""

@@ -79,7 +79,7 @@ def of_features(branch: Branch, zero: Point, peak: Point, detachment: Point) -> 
         + zero_position
         + _radius_at_peak(branch, peak) * _steepness(branch, peak),
         "zero_force_position": zero_position,
-        "onset_position": on_branch(branch, branch.node(0)).position,
+        "onset_position": on_branch(branch, branch.onset).position,
         "detachment_position": at_end.position,
         "detachment_radius": _radius_at_fold(branch, detachment),
     }
@@ -90,7 +90,7 @@ def _anywhere(branch: Branch, point: Point) -> Uncertainty:
 
 
 def _is_pinned(branch: Branch, point: Point) -> bool:
-    return bool(point.radius == branch.cone.start_radius and point.t < branch.t[0])
+    return bool(point.radius == branch.cone.start_radius and point.t < branch.onset.t)
 
 
 def _yield(branch: Branch, point: Point) -> float:

@@ -55,7 +55,7 @@ class Path:
 
 def trace(branch: Branch, start_slope: float) -> Path:
     """Follow the contact line from z_0 to detachment."""
-    onset = branch.node(0)
+    onset = branch.onset
     start = _pinned_point(branch, min(start_slope, onset.t))
     return Path(Pinned(start, onset), tuple(_stretches(branch)))
 
@@ -67,13 +67,13 @@ def _stretches(branch: Branch) -> list[Stretch]:
     begin = 0
     last = len(branch.radius) - 1
     falls = branch.climb > 0  # z falls as the radius shrinks: unstable
-    landed = branch.node(0)
+    landed = branch.onset
     turns = np.flatnonzero(falls[1:] != falls[:-1]).tolist()
     for index in ([-1] if falls[0] else []) + turns + ([] if falls[last] else [last]):
         if 0 <= index < last and falls[index]:
             trough, begin = branch.turning(index), index + 1
             continue
-        top = branch.turning(index) if 0 <= index < last else branch.node(max(index, 0))
+        top = branch.turning(index) if 0 <= index < last else branch.onset if index < 0 else branch.node(last)
         if path:
             level = path[-1].last.position
             if top.position <= level or trough is None:

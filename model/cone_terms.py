@@ -44,6 +44,16 @@ class Edge(NamedTuple):
     load_slope: Number
     cap: Number
     """V_c."""
+    outer: Number
+    """1 + rho."""
+    area: Number
+    """dV/dz."""
+    lever: Number
+    """dV/drho at constant z is lever * (t + slope)."""
+    swell: Number
+    """Derivative with respect to t of what the pressure depends on: V, or z if it was measured."""
+    shrink: Number
+    """The same with respect to rho at constant t, divided by -(t + slope)."""
 
 
 class State(NamedTuple):
@@ -78,7 +88,7 @@ class Isothermal:
         change = growth + self.offset
         volume = self.anchor + change
         pressure = (self.initial * self.anchor - self.atmosphere * change) / volume
-        return pressure, -(pressure + self.atmosphere) / volume
+        return pressure, (-self.atmosphere - pressure) / volume
 
     def potential(self, growth: float) -> float:
         """Return U_p, up to a constant."""
@@ -147,60 +157,79 @@ class Cone:
 
     def edge(self, radius: Number) -> Edge:
         """Return what depends on the contact radius alone; a flat needs neither cap nor contact stretch."""
-        gap = 1 - radius
+        gap, outer = 1 - radius, 1 + radius
+        square = radius * radius
+        area, lever = outer + square, (outer + radius) * gap
+        driven = isinstance(self.gas, Driven)
+        volume = (outer, area, lever, gap if driven else gap * area, 1.0 if driven else 3 * square)
+        load = -self.adhesion * radius
         if self.sphere is None:
-            return Edge(radius, gap, 0.0, 0.0, 0.0, -self.adhesion * radius, -self.adhesion, 0.0)
+            return Edge(radius, gap, 0.0, 0.0, 0.0, load, -self.adhesion, 0.0, *volume)
         self._count("spherical cap", radius)
         array = isinstance(radius, np.ndarray)
         u = radius / self.sphere
         cosine = (np.sqrt if array else math.sqrt)((1 - u) * (1 + u))
         cosine = np.maximum(cosine, EQUATOR) if array else max(cosine, EQUATOR)
-        drop = radius * u / (1 + cosine)
-        load, load_slope = -self.adhesion * radius, -self.adhesion
-        if self.contact_stretch:
-            self._count("contact stretch", radius)
-            stretch, stretch_slope = _contact_stretch(u, cosine, arc_excess_array(u) if array else arc_excess(u))
-            load, load_slope = load + radius * stretch, load_slope + stretch_slope
-        slope = u / cosine
+        drop, slope = radius * u / (1 + cosine), u / cosine
         curvature = 1 / (self.sphere * cosine**3)
-        return Edge(radius, gap, drop, slope, curvature, load, load_slope, drop * (3 * radius**2 + drop**2) / 2)
+        cap = drop * (3 * square + drop * drop) / 2
+        if not self.contact_stretch:
+            return Edge(radius, gap, drop, slope, curvature, load, -self.adhesion, cap, *volume)
+        self._count("contact stretch", radius)
+        stretch, stretch_slope = _contact_stretch(u, cosine, arc_excess_array(u) if array else arc_excess(u))
+        load, load_slope = load + radius * stretch, stretch_slope - self.adhesion
+        return Edge(radius, gap, drop, slope, curvature, load, load_slope, cap, *volume)
 
     def residual(self, edge: Edge, t: Number) -> tuple[Number, Number]:
         """Return dPi/drho at constant z and its derivative with respect to t."""
-        radius, gap = edge.radius, edge.gap
-        energy, energy_t, energy_tt = stretch_energy(t)
         self._count("elastic energy", t)
+        energy, energy_t, energy_tt = stretch_energy(t)
         tau = t + edge.slope
-        lever = (1 + 2 * radius) * gap
-        pressure, pressure_t, _ = self._pressure(edge, t, tau)
-        value = (1 + radius) * tau * energy_t - 2 * radius * energy + edge.load - pressure * lever * tau
-        slope = gap * energy_t + (1 + radius) * tau * energy_tt - lever * (pressure + tau * pressure_t)
-        return value, slope
+        elastic = edge.load - 2 * edge.radius * energy
+        if self.unpressurised:
+            return (
+                elastic + tau * edge.outer * energy_t,
+                edge.gap * energy_t + tau * edge.outer * energy_tt,
+            )
+        pressure, rate = self._pressure(edge, t)
+        pull = edge.lever * pressure
+        return (
+            elastic + tau * (edge.outer * energy_t - pull),
+            edge.gap * energy_t - pull + tau * (edge.outer * energy_tt - edge.lever * edge.swell * rate),
+        )
 
     def state(self, edge: Edge, t: Number) -> State:
         """Return force, pressure and all first derivatives of force and residual."""
-        radius, gap = edge.radius, edge.gap
-        energy, energy_t, energy_tt = stretch_energy(t)
         self._count("elastic energy", t)
+        energy, energy_t, energy_tt = stretch_energy(t)
+        radius, outer, curvature = edge.radius, edge.outer, edge.curvature
         tau = t + edge.slope
-        widening = 1 + 2 * radius
-        lever = widening * gap
-        area = 1 + radius + radius**2
-        pressure, pressure_t, pressure_radius = self._pressure(edge, t, tau)
+        residual = edge.load - 2 * radius * energy
+        residual_radius = (tau + outer * curvature) * energy_t - 2 * energy + edge.load_slope
+        if self.unpressurised:
+            return State(
+                residual + tau * outer * energy_t,
+                edge.gap * energy_t + tau * outer * energy_tt,
+                residual_radius,
+                -outer * energy_t,
+                -outer * energy_tt,
+                -energy_t,
+                0.0,
+            )
+        pressure, rate = self._pressure(edge, t)
+        pressure_t, pressure_radius = rate * edge.swell, -rate * edge.shrink * tau
+        pull = edge.lever * pressure
         return State(
-            residual=(1 + radius) * tau * energy_t - 2 * radius * energy + edge.load - pressure * lever * tau,
-            residual_t=gap * energy_t + (1 + radius) * tau * energy_tt - lever * (pressure + tau * pressure_t),
-            residual_radius=(
-                (tau + (1 + radius) * edge.curvature) * energy_t
-                - 2 * energy
-                + edge.load_slope
-                - pressure * ((1 - 4 * radius) * tau + lever * edge.curvature)
-                - pressure_radius * lever * tau
-            ),
-            force=pressure * area - (1 + radius) * energy_t,
-            force_t=pressure_t * area - (1 + radius) * energy_tt,
-            force_radius=pressure * widening + pressure_radius * area - energy_t,
-            pressure=pressure,
+            residual + tau * (outer * energy_t - pull),
+            edge.gap * energy_t - pull + tau * (outer * energy_tt - edge.lever * pressure_t),
+            residual_radius
+            - pressure * (1 - 4 * radius) * tau
+            - pull * curvature
+            - pressure_radius * edge.lever * tau,
+            pressure * edge.area - outer * energy_t,
+            pressure_t * edge.area - outer * energy_tt,
+            pressure * (outer + radius) + pressure_radius * edge.area - energy_t,
+            pressure,
         )
 
     def position(self, edge: Edge, t: Number) -> Number:
@@ -209,7 +238,7 @@ class Cone:
 
     def growth(self, edge: Edge, t: Number) -> Number:
         """Return V - V_0, EML Eq. 7."""
-        return edge.gap * t * (1 + edge.radius + edge.radius**2) - edge.cap
+        return edge.gap * edge.area * t - edge.cap
 
     def potential(self, edge: Edge, t: float) -> float:
         """Return Pi (EML Eq. 1) up to a constant; floats only, not for a measured pressure."""
@@ -224,21 +253,20 @@ class Cone:
             return float(energy - self.gas.initial * self.growth(edge, t))
         return float(energy)
 
-    def _pressure(self, edge: Edge, t: Number, tau: Number) -> tuple[Number, Number, Number]:
-        """Return the gauge pressure and its derivatives with respect to t and, at constant t, to rho."""
+    @cached_property
+    def unpressurised(self) -> bool:
+        """Whether the chamber is open to the room: no gas term is evaluated at all."""
+        return isinstance(self.gas, Vented) and isinstance(self.gas.initial, float) and self.gas.initial == 0
+
+    def _pressure(self, edge: Edge, t: Number) -> tuple[Number, Number]:
+        """Return the gauge pressure and its rate with the volume, or with z if it was measured."""
         gas = self.gas
         if isinstance(gas, Vented):
-            return gas.initial, 0.0, 0.0
+            return gas.initial, 0.0
         self._count("chamber gas", t)
         if isinstance(gas, Driven):
-            pressure, steepness = gas.at(self.position(edge, t))
-            return pressure, steepness * edge.gap, -steepness * tau
-        pressure, steepness = gas.at(self.growth(edge, t))
-        return (
-            pressure,
-            steepness * edge.gap * (1 + edge.radius + edge.radius**2),
-            -3 * steepness * edge.radius**2 * tau,
-        )
+            return gas.at(self.position(edge, t))
+        return gas.at(edge.swell * t - edge.cap)
 
     def _count(self, term: str, where: Number) -> None:
         self.evaluations[term] = self.evaluations.get(term, 0) + (where.size if isinstance(where, np.ndarray) else 1)
@@ -248,7 +276,9 @@ def stretch_energy(t: Number) -> tuple[Number, Number, Number]:
     """Return (lambda - 1 / lambda)^2 with lambda^2 = 1 + t^2 (EML Eqs. 2-4) and its first two derivatives."""
     x = t * t
     y = 1 / (1 + x)
-    return x * x * y, 2 * t * x * (2 + x) * y * y, 2 * x * (6 + x * (3 + x)) * y * y * y
+    xy = x * y
+    twice = (xy + xy) * y
+    return x * xy, twice * t * (2 + x), twice * y * (6 + x * (3 + x))
 
 
 def _contact_stretch(u: Number, cosine: Number, excess: Number) -> tuple[Number, Number]:
