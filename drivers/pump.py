@@ -431,7 +431,8 @@ class LegatoPump:
         try:
             with self._writing:
                 self._awaited.extend(requests)
-                self._port.write("".join(f"{self._prefix}{command}\r" for command in commands).encode("ascii"))
+                lines = (f"{self._prefix}{command}\r" if command else "\r" for command in commands)
+                self._port.write("".join(lines).encode("ascii"))
         except OSError as error:
             raise self._lost(commands[-1], error) from error
         return requests[-1]
