@@ -71,7 +71,7 @@ class Reply(NamedTuple):
         tagged = address != 0 or self.address is not None
         prefix = f"{address:02d}:" if tagged else ""
         prompt = f"{address:02d}{self.prompt}" if tagged else self.prompt
-        return ("\n" + "".join(f"{prefix}{line}\r\n" for line in self.lines) + prompt).encode("ascii")
+        return ("\n" + "".join(f"{prefix}{line}\r\n" for line in self.lines) + prompt).encode("ascii", errors="replace")
 
 
 class Family(NamedTuple):
@@ -215,7 +215,7 @@ class EmulatedLegato:
         """Return the prompt that a run's end brings up, once, while polling is off."""
         with self._world.lock:
             self._catch_up()
-            if self.polled or self._touched or self._prompt == self._announced:
+            if self.polled or self._touched or not self._ended or self._prompt == self._announced:
                 return None
             self._announced = self._prompt
             return Reply((), self._prompt)
@@ -337,12 +337,12 @@ class EmulatedLegato:
             ends["target"] = (self._target_time - self._times[direction]) * rate
         self._ending = min(ends, key=lambda reason: ends[reason])
         remaining = ends[self._ending]
-        if self._ending == "limit" and remaining <= 0:
+        if self._ending == "limit" and remaining < FEMTOLITRE:
             self._direction, self._ended = direction, "limit"
             raise command_error("Limit switch is active")
         self._direction, self._running, self._ended = direction, direction, ""
         self._run_target, self._run_volume = ends.get("target", math.inf), 0.0
-        if remaining <= 0:
+        if remaining < FEMTOLITRE:
             self._end("target")
             return
         self._world.syringe.run(direction * rate, remaining)
