@@ -45,6 +45,7 @@ class Extraction:
     missing: dict[str, str] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
     methods: dict[str, dict[str, float]] = field(default_factory=dict)
+    stated: dict[str, float] = field(default_factory=dict)
     windows: Windows = field(init=False)
     noise: Noise = field(init=False)
     baseline: np.polynomial.Polynomial = field(init=False)
@@ -122,6 +123,7 @@ class ExtractionStep:
     after: tuple[str, ...]
     uses: tuple[str, ...]
     protocols: tuple[str, ...]
+    once: bool
     function: Callable[[Extraction], Details]
 
     @property
@@ -142,6 +144,7 @@ def extraction_step(
     after: Iterable[str] = (),
     uses: Iterable[str] = (),
     protocols: Iterable[str] = (),
+    once: bool = False,
 ) -> Callable[[Callable[[Extraction], Details]], Callable[[Extraction], Details]]:
     """Register a step.
 
@@ -157,12 +160,13 @@ def extraction_step(
         Steps that come first but may have failed.
     protocols
         Protocols the step belongs to; all where empty.
+    once
+        Whether the step is too slow to repeat for uncertainties, and states its own in ``Extraction.stated``.
     """
 
     def register(function: Callable[[Extraction], Details]) -> Callable[[Extraction], Details]:
-        STEPS[name] = ExtractionStep(
-            name, title, dict(gives or {}), tuple(after), tuple(uses), tuple(protocols), function
-        )
+        order = (tuple(after), tuple(uses), tuple(protocols))
+        STEPS[name] = ExtractionStep(name, title, dict(gives or {}), *order, once, function)
         return function
 
     return register
@@ -198,18 +202,28 @@ def meanings() -> dict[str, str]:
 
 
 def ordered() -> list[ExtractionStep]:
-    """Return the registered steps, each behind those it needs or uses."""
-    from graphlib import TopologicalSorter
+    """Return the registered steps as they were registered, but each behind those it needs or uses."""
+    done: dict[str, ExtractionStep] = {}
 
-    graph = {step.name: (*step.after, *step.uses) for step in STEPS.values()}
-    return [STEPS[name] for name in TopologicalSorter(graph).static_order()]
+    def place(step: ExtractionStep) -> None:
+        for name in (*step.after, *step.uses):
+            if name not in done:
+                place(STEPS[name])
+        done.setdefault(step.name, step)
+
+    for step in STEPS.values():
+        place(step)
+    return list(done.values())
 
 
-def extract(run: Run) -> Extraction:
-    """Run every step that applies; a step that finds nothing leaves its features missing, with the reason."""
+def extract(run: Run, *, again: bool = False) -> Extraction:
+    """Run every step that applies; a step that finds nothing leaves its features missing, with the reason.
+
+    ``again`` leaves out the steps that are done once only.
+    """
     work = Extraction(run)
     for step in ordered():
-        if step.protocols and run.protocol not in step.protocols:
+        if (step.protocols and run.protocol not in step.protocols) or (again and step.once):
             continue
         reason = next((f"needs {name}: {work.failed[name]}" for name in step.after if name in work.failed), None)
         if reason is None:

@@ -230,6 +230,7 @@ def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float
     title="JKR, DMT and Maugis beside S13",
     after=("work of adhesion", "detachment"),
     protocols=("indentation",),
+    once=True,
     gives={
         "fitted_work_of_adhesion_J_m2": "work of adhesion of the contact model that fits the retraction best",
         "fitted_modulus_Pa": "contact modulus E* of that model",
@@ -245,7 +246,12 @@ def contact_models(work: Extraction) -> Details:
     part = slice(start, int(work.release))
     radius = indenter_radius(work.run)
     fits = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
-    work.set(fitted_work_of_adhesion_J_m2=fits[0].work_of_adhesion, fitted_modulus_Pa=fits[0].modulus)
+    best, gain = fits[0], work.run.sensors.force_gain
+    work.set(fitted_work_of_adhesion_J_m2=best.work_of_adhesion, fitted_modulus_Pa=best.modulus)
+    work.stated["fitted_work_of_adhesion_J_m2"] = math.hypot(
+        best.work_of_adhesion_uncertainty, gain * best.work_of_adhesion
+    )
+    work.stated["fitted_modulus_Pa"] = math.hypot(best.modulus_uncertainty, gain * best.modulus)
     words = "; ".join(
         f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in fits
     )

@@ -197,7 +197,21 @@ def find_jumps(values: Array, noise: Noise, width: int, smallest: float) -> list
         return []
     groups = np.split(flagged, np.flatnonzero(np.diff(flagged) > width) + 1)
     tested = (_test_jump(values, _centre(contrast, group), noise, width, smallest) for group in groups)
-    return [_sharpen(values, jump, noise, width, smallest) for jump in tested if jump is not None]
+    sharp = [_sharpen(values, jump, noise, width, smallest) for jump in tested if jump is not None]
+    return _merged(sorted(sharp, key=lambda jump: jump.start), 2 * width)
+
+
+def _merged(jumps: list[ForceJump], gap: int) -> list[ForceJump]:
+    """Join neighbours: a jump found twice, or a slow one found in parts."""
+    joined: list[ForceJump] = []
+    for jump in jumps:
+        last = joined[-1] if joined else None
+        if last is not None and jump.start - last.stop <= gap:
+            ends = last if last.stop >= jump.stop else jump
+            joined[-1] = ForceJump(last.start, ends.stop, last.before, ends.after, last.slope_before)
+        else:
+            joined.append(jump)
+    return joined
 
 
 def _sharpen(values: Array, jump: ForceJump, noise: Noise, width: int, smallest: float) -> ForceJump:
@@ -207,7 +221,8 @@ def _sharpen(values: Array, jump: ForceJump, noise: Noise, width: int, smallest:
         change = np.abs(np.diff(running_mean(values[max(0, jump.start - 1) : jump.stop + 2], max(1, width // 8))))
         centre = max(0, jump.start - 1) + int(np.argmax(change)) + 1
         closer = _test_jump(values, centre, noise, width, smallest)
-        if closer is None or abs(closer.size) < 0.5 * abs(jump.size):
+        shorter = closer is not None and closer.stop - closer.start <= (jump.stop - jump.start) // 2
+        if closer is None or not shorter or abs(closer.size) < 0.5 * abs(jump.size):
             break
         jump = closer
     return jump
@@ -235,10 +250,18 @@ def _test_jump(values: Array, centre: int, noise: Noise, width: int, smallest: f
     below = np.flatnonzero(fraction[: crossing + 1] < 0.1)
     above = np.flatnonzero(fraction[crossing:] > 0.9)
     start = int(places[below[-1]]) if below.size else left_stop
-    stop = int(places[crossing + above[0]]) if above.size else right_start
-    return ForceJump(
-        start, max(stop, start + 1), float(before(start)), float(after(stop)), float(before.deriv()(start))
-    )
+    stop = max(int(places[crossing + above[0]]) if above.size else right_start, start + 1)
+    steepest = max(abs(float(line.deriv()(centre))) for line in (before, after))
+    if abs(size) < 2 * steepest * (stop - start):  # a kink: the slopes on either side explain the change
+        return None
+    for line, window in ((before, (left_start, left_stop)), (after, (right_start, right_stop))):
+        if _misfit(values, line, *window) > max(3 * noise.sigma, 0.15 * abs(size)):  # another jump is in the way
+            return None
+    return ForceJump(start, stop, float(before(start)), float(after(stop)), float(before.deriv()(start)))
+
+
+def _misfit(values: Array, line: np.polynomial.Polynomial, start: int, stop: int) -> float:
+    return float(np.std(values[start:stop] - line(np.arange(start, stop, dtype=np.float64))))
 
 
 def _line(values: Array, start: int, stop: int) -> np.polynomial.Polynomial:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis import chamber, indentation, loading, preparation, retraction  # noqa: F401  (importing registers the steps)
 from analysis.extraction import Extraction, extract, meanings, ordered, unit_of
 from analysis.numerics import Array, block_means
 from analysis.propagation import budget
@@ -17,6 +17,10 @@ from analysis.run import Run
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+for _module in ("preparation", "loading", "retraction", "indentation", "chamber"):  # in the order they are reported
+    import_module(f"analysis.{_module}")
 
 
 @dataclass(frozen=True)

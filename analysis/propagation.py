@@ -27,13 +27,15 @@ def budget(work: Extraction) -> dict[str, dict[str, float]]:
     """Return, for each feature, its standard uncertainty by source."""
     parts: dict[str, dict[str, float]] = {name: {} for name in work.values}
     for source, changed in _systematic(work):
-        for name, value in extract(changed).values.items():
+        for name, value in extract(changed, again=True).values.items():
             if name in parts:
                 _add(parts[name], source, value - work.values[name])
     for name, spread in _noise(work).items():
         _add(parts[name], "noise", spread)
     for name, sources in _sampling(work).items():
         _add(parts[name], "sampling", sources)
+    for name, uncertainty in work.stated.items():
+        _add(parts[name], "fit", uncertainty)
     if "contact_height_m" in parts:
         _add(parts["contact_height_m"], "contact point", work.values["contact_spread_m"])
     return parts
@@ -114,7 +116,7 @@ def _noise(work: Extraction) -> Mapping[str, float]:
         changed = replace(run, force=run.force + work.noise.draw(run.force.size, generator))
         if run.pressure is not None and pressure_noise is not None:
             changed = replace(changed, pressure=run.pressure + pressure_noise.draw(run.pressure.size, generator))
-        for name, value in extract(changed).values.items():
+        for name, value in extract(changed, again=True).values.items():
             if name in samples:
                 samples[name].append(value - work.values[name])
     return {name: _spread(np.array(values)) for name, values in samples.items() if len(values) >= DRAWS // 2}
@@ -129,7 +131,7 @@ def _spread(differences: Array) -> float:
 
 
 def _pressure_noise(work: Extraction) -> Noise | None:
-    if work.run.pressure is None or "pressure" not in work.details:
+    if work.run.pressure is None:
         return None
     start, stop = work.windows.free
     part = work.run.pressure[start:stop]

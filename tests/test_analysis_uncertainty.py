@@ -1,0 +1,46 @@
+"""Stated uncertainties against synthetic truth: 68 % of the intervals should hold it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from analysis.coverage import CASES, coverage, deviations
+
+FEATURES = (
+    "pull_off_force_N",
+    "pull_off_distance_m",
+    "preload_N",
+    "initial_pressure_Pa",
+    "adhesion_energy_J",
+)
+
+
+def test_a_sample_of_pull_off_tests_is_covered() -> None:
+    found = deviations("pull_off", range(16))
+    for name in FEATURES:
+        scores = np.array(found[name])
+        assert np.isfinite(scores).all(), name
+        assert 6 <= np.count_nonzero(np.abs(scores) < 1) <= 16, (name, scores)
+        assert np.abs(np.median(scores)) < 1, (name, scores)
+
+
+@pytest.mark.parametrize(
+    ("kind", "feature"), [("volume", "chamber_volume_m3"), ("indentation", "work_of_adhesion_J_m2")]
+)
+def test_a_sample_of_other_protocols_is_covered(kind: str, feature: str) -> None:
+    scores = np.array(deviations(kind, range(12))[feature])
+    assert np.isfinite(scores).all()
+    assert 4 <= np.count_nonzero(np.abs(scores) < 1) <= 12, scores
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("kind", "tests"), [("pull_off", 400), ("volume", 400), ("indentation", 400)])
+def test_68_percent_intervals_hold_the_truth_in_60_to_76_percent(kind: str, tests: int) -> None:
+    table = coverage(kind, range(tests))
+    assert set(CASES) >= {kind}
+    for row in table.itertuples():
+        assert row.missing == 0, row
+        assert 0.60 <= row.within_one_uncertainty <= 0.76, row
+        assert abs(row.mean_deviation) < 0.25, row
