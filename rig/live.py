@@ -321,7 +321,8 @@ class _Announcement:
 
     def _grid(self, middle: float, last: float) -> tuple[Array, Array]:
         """Return z_r of the curve's points and the model's heights they show: what is to come is stretched to D_p."""
-        first = min(float(self._curves.height[0]), self._evidence.start)
+        data = self._fit.height
+        first = float(data[0]) if data.size else max(float(self._curves.height[0]), self._evidence.start)
         shown = np.linspace(first, middle, POINTS - 3)
         shown = np.append(shown, [middle + 1e-9, last, last + 1e-9])
         way = max(middle - self._now, 1e-9)

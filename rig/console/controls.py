@@ -43,7 +43,7 @@ class RunControls(QWidget):
         super().__init__()
         self.scene = QComboBox()
         self.scene.addItems(scenes)
-        self.scene.setMinimumWidth(240)
+        self.scene.setMinimumWidth(200)
         self.scene.setAccessibleName("scene")
         self.bench = QComboBox()
         self.bench.addItem("emulated bench", None)
@@ -64,7 +64,7 @@ class RunControls(QWidget):
         self.resume = button("Resume", "F7", "Go on after a hold", actions["resume"])
         self.stop = button("Stop", "F8", "End the run in good order", actions["stop"])
         self.attach = button("Attach", "F9", "Watch a run that is already going", actions["attach"])
-        self.open = button("Replay\u2026", "Ctrl+O", "Replay a recording", actions["open"])
+        self.open = button("Replay", "Ctrl+O", "Replay a recording", actions["open"])
         browse = button("\u2026", "", "Take a scene or a bench from a file", self._browse)
         browse.setAccessibleName("scene or bench from a file")
         row = QHBoxLayout(self)
@@ -75,7 +75,7 @@ class RunControls(QWidget):
         row.addStretch(1)
         for widget in (self.check, self.run, self.hold, self.resume, self.stop):
             row.addWidget(widget)
-        row.addSpacing(24)
+        row.addSpacing(12)
         row.addWidget(self.attach)
         row.addWidget(self.open)
 

@@ -14,7 +14,7 @@ from drivers.interfaces import PumpState
 from rig.console.story import Moment, Story
 from rig.console.theme import DARK, Theme
 from rig.console.words import condition, fraction, number
-from rig.live import Estimate
+from rig.live import Estimate, LivePrediction
 from rig.observe import RunInfo
 
 
@@ -230,12 +230,10 @@ class PredictionCard(Card):
         self.measured.setText("")
         self._say(f"{model} model, the scene's own values", "")
 
-    def show_moment(self, moment: Moment) -> None:
-        """Show the prediction of this moment, and the measured values once the run has ended."""
+    def show_moment(self, moment: Moment, first: LivePrediction | None, measured: tuple[float, float] | None) -> None:
+        """Show the prediction of this moment, the ``first`` one beside it, and what was measured once it is over."""
         prediction = moment.prediction
         if prediction is None:
-            if not self.force.text().endswith("]</span>"):
-                return
             self.clear()
             return
         self.force.setText(_interval("F<sub>p</sub>", prediction.pull_off_force, 1.0, "N"))
@@ -243,12 +241,15 @@ class PredictionCard(Card):
         work = prediction.work_of_adhesion
         self.work.setText(
             f"\u03c9<sub>a</sub> {number(work.value, 2)} J/m\u00b2 [{number(work.low, 2)}, {number(work.high, 2)}]"
+            + ("" if first is None else f"<br>{_at_start(first)}")
         )
-        if prediction.inside:
+        self.measured.setText("" if measured is None else _measured(*measured))
+        if not prediction.inside:
+            self._say(f"\u26a0 {prediction.note or 'the data have left the band'}", "warning")
+        elif measured is None:
             self._say("\u2713 data inside the band", "good")
         else:
-            self._say(f"\u26a0 {prediction.note or 'the data have left the band'}", "warning")
-        self.measured.setText(_measured(moment))
+            self._say(*_verdict(prediction if first is None else first, *measured))
 
     def _say(self, text: str, tone: str) -> None:
         self.note.setText(text)
@@ -262,25 +263,31 @@ def _interval(symbol: str, estimate: Estimate | None, scale: float, unit: str) -
     return f"{symbol} {number(estimate.value * scale, 3)} {unit} <span style='font-size:15px'>[{low}, {high}]</span>"
 
 
-def _measured(moment: Moment) -> str:
-    if moment.ending is None:
-        return ""
-    features = moment.ending.features
-    parts = [
-        f"{symbol} {number(value * scale, 3)} {unit}"
-        for key, symbol, scale, unit in (
-            ("pull_off_force_N", "F<sub>p</sub>", 1.0, "N"),
-            ("pull_off_distance_m", "D<sub>p</sub>", 1e3, "mm"),
-        )
-        if (value := _value(features.get(key))) is not None
+def _at_start(first: LivePrediction) -> str:
+    force, distance = first.pull_off_force, first.pull_off_distance
+    return (
+        f"at P\u2080: F<sub>p</sub> {number(force.low, 2)} to {number(force.high, 2)} N, "
+        f"D<sub>p</sub> {number(distance.low * 1e3, 2)} to {number(distance.high * 1e3, 2)} mm"
+    )
+
+
+def _measured(force: float, distance: float) -> str:
+    return (
+        "<span style='font-size:18px'><b>measured "
+        f"F<sub>p</sub> {number(force, 3)} N, D<sub>p</sub> {number(distance * 1e3, 3)} mm</b></span>"
+    )
+
+
+def _verdict(said: LivePrediction, force: float, distance: float) -> tuple[str, str]:
+    """Hold what was measured against the intervals announced when P_0 was reached."""
+    missed = [
+        name
+        for name, estimate, value in (("F_p", said.pull_off_force, force), ("D_p", said.pull_off_distance, distance))
+        if not estimate.low <= value <= estimate.high
     ]
-    return f"<b>measured: {', '.join(parts)}</b>" if parts else ""
-
-
-def _value(feature: object) -> float | None:
-    if isinstance(feature, dict):
-        feature = feature.get("value")
-    return float(feature) if isinstance(feature, int | float) else None
+    if missed:
+        return f"\u26a0 {' and '.join(missed)} outside the band announced at P\u2080", "warning"
+    return "\u2713 F_p and D_p inside the band announced at P\u2080", "good"
 
 
 class StageCard(Rows):
@@ -337,7 +344,7 @@ class RecordingCard(Rows):
         """Note the file."""
         self._path = Path(info.recording) if info.recording else None
         name = self._path.name if self._path else "none"
-        self.set("file", name if len(name) < 30 else f"\u2026{name[-28:]}")
+        self.set("file", name if len(name) < 26 else f"\u2026{name[-24:]}")
         self._values["file"].setToolTip(info.recording)
         self.set("last flush", "replayed" if replay else "\N{EN DASH}")
         if replay:

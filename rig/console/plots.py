@@ -56,7 +56,10 @@ class Plot:
         self.item.hideButtons()
         self.item.setMenuEnabled(False)
         self.item.disableAutoRange()
-        self.item.showGrid(x=True, y=True, alpha=0.25)
+        self._grid: Any = pg.PlotCurveItem(connect="pairs", skipFiniteCheck=True)
+        self._grid.setZValue(-20)
+        self.item.addItem(self._grid, ignoreBounds=True)
+        self.item.getViewBox().sigRangeChanged.connect(lambda *_: self._rule())
         self.following = True
         self.item.getViewBox().sigRangeChangedManually.connect(self._unfollow)
         self.item.getViewBox().sigXRangeChanged.connect(lambda *_: self._zoomed())
@@ -112,6 +115,17 @@ class Plot:
             axis.setLabel(f"{quantity.symbol} ({quantity.unit})", **{"font-size": "16px", "color": theme.text})
         self.item.getAxis("left").setWidth(72)
         self.measured.setPen(pg.mkPen(theme.measured, width=2))
+        self._grid.setPen(pg.mkPen(theme.line, width=1))
+
+    def _rule(self) -> None:
+        """Draw the grid as one item: the axes' own is the dearest part of a picture."""
+        (left, right), (bottom, top) = self.item.getViewBox().viewRange()
+        size = self.item.getViewBox().size()
+        xs = self.item.getAxis("bottom").tickValues(left, right, size.width())[0][1]
+        ys = self.item.getAxis("left").tickValues(bottom, top, size.height())[0][1]
+        x = [*np.repeat(xs, 2), *([left, right] * len(ys))]
+        y = [*([bottom, top] * len(xs)), *np.repeat(ys, 2)]
+        self._grid.setData(np.array(x, np.float64), np.array(y, np.float64))
 
     def refollow(self) -> None:
         """Show the newest data again."""
@@ -148,6 +162,12 @@ class Plot:
         low, high = self.item.getViewBox().viewRange()[0]
         return low / self.x.scale, high / self.x.scale
 
+    def _set_x(self, low: float, high: float) -> None:
+        """Set the horizontal range if it has changed: drawing an axis anew is the dearest part of a picture."""
+        shown = self.item.getViewBox().viewRange()[0]
+        if abs(shown[0] - low) + abs(shown[1] - high) > 2e-3 * (high - low):
+            self.item.setXRange(low, high, padding=0)
+
     def _fit_y(self, *series: Array) -> None:
         """Fit the vertical range to what is drawn; let it breathe only when something leaves it or a lot is empty."""
         joined = np.concatenate([part[np.isfinite(part)] for part in series]) if series else _EMPTY
@@ -174,6 +194,7 @@ class TimePlot(Plot):
         self.window.setCheckable(True)
         self.bar.insertWidget(2, self.window)
         self._marks: list[Any] = []
+        self._marked: list[tuple[float, str]] = []
         self._theme: Theme | None = None
 
     def paint(self, theme: Theme) -> None:
@@ -200,9 +221,7 @@ class TimePlot(Plot):
             return
         story, moment = self._shown
         if self.following:
-            end = max(moment.time, 5.0)
-            begin = max(0.0, end - WINDOW_S) if self.window.isChecked() else 0.0
-            self.item.setXRange(begin, begin + (end - begin) * 1.02, padding=0)
+            self._set_x(*self._followed(moment.time))
         start, stop = self._stretch(story, moment)
         index, least, greatest = self._signal(story).view(start, stop, BLOCKS)
         x, y = polyline((index + 1) / story.rate, least, greatest)
@@ -211,11 +230,30 @@ class TimePlot(Plot):
         self._fit_y(y)
         self._mark([(sample / story.rate, name) for sample, name in story.boundaries(moment)])
 
+    def _followed(self, time: float) -> tuple[float, float]:
+        """Whole run: the axis grows by a quarter at a time, so that it need not be drawn anew with every picture."""
+        if self.window.isChecked():
+            end = max(WINDOW_S, np.ceil(time))
+            return end - WINDOW_S, end
+        end = 10.0
+        while end < time:
+            end *= 1.25
+        return 0.0, end
+
     def _stretch(self, story: Story, moment: Moment) -> tuple[int, int]:
         low, high = self._range()
         return max(0, int(low * story.rate)), max(0, min(moment.sample, int(high * story.rate) + 2))
 
     def _mark(self, boundaries: list[tuple[float, str]]) -> None:
+        low, high = self.item.getViewBox().viewRange()[0]
+        near = 0.03 * (high - low)
+        later = [*(time for time, _ in boundaries[1:]), np.inf][: len(boundaries)]
+        boundaries = [
+            (time, "" if after - time < near else name) for (time, name), after in zip(boundaries, later, strict=True)
+        ]
+        if boundaries == self._marked:
+            return
+        self._marked = boundaries
         while len(self._marks) > len(boundaries):
             self.item.removeItem(self._marks.pop())
         for place, (time, name) in enumerate(boundaries):
@@ -225,7 +263,7 @@ class TimePlot(Plot):
                 self._colour(mark)
                 self.item.addItem(mark, ignoreBounds=True)
                 self._marks.append(mark)
-            elif self._marks[place].value() != time:
+            else:
                 self._marks[place].setValue(time)
                 self._marks[place].label.setFormat(name)
 
@@ -250,16 +288,25 @@ class RetractionPlot(Plot):
     def __init__(self, y: Quantity, export: Callable[[Plot, str], None]) -> None:
         super().__init__(RETRACTION, y, export)
         self.model: Any = pg.PlotCurveItem(connect="finite")
-        self._low: Any = pg.PlotCurveItem()
-        self._high: Any = pg.PlotCurveItem()
+        self._low: Any = pg.PlotCurveItem(connect="finite")
+        self._high: Any = pg.PlotCurveItem(connect="finite")
         self.band: Any = pg.FillBetweenItem(self._low, self._high)
+        self.announced: Any = pg.PlotCurveItem(connect="finite")
         self.point: Any = pg.ScatterPlotItem(symbol="d", size=15)
         self.bars: Any = pg.ErrorBarItem(x=_EMPTY, y=_EMPTY, beam=0.0)
         self.legend = QLabel()
         self.legend.setTextFormat(Qt.TextFormat.RichText)
         self.bar.insertWidget(1, self.legend)
         self.bar.insertSpacing(1, 18)
-        for depth, item in ((-3, self.band), (-2, self._low), (-2, self._high), (-1, self.model), (1, self.bars)):
+        layers = (
+            (-4, self.announced),
+            (-3, self.band),
+            (-2, self._low),
+            (-2, self._high),
+            (-1, self.model),
+            (1, self.bars),
+        )
+        for depth, item in layers:
             item.setZValue(depth)
             self.item.addItem(item)
         self.point.setZValue(2)
@@ -273,6 +320,7 @@ class RetractionPlot(Plot):
         super().paint(theme)
         colour = QColor(theme.model)
         self.model.setPen(pg.mkPen(colour, width=2.5, style=Qt.PenStyle.DashLine))
+        self.announced.setPen(pg.mkPen(colour, width=1.5, style=Qt.PenStyle.DotLine))
         self.point.setBrush(colour)
         self.point.setPen(pg.mkPen(theme.card, width=1))
         self.bars.setData(pen=pg.mkPen(colour, width=2))
@@ -283,7 +331,8 @@ class RetractionPlot(Plot):
         self.band.setBrush(colour)
         self.legend.setText(
             f"<span style='color:{theme.measured}'>\u2501\u2501 measured</span>&nbsp;&nbsp; "
-            f"<span style='color:{theme.model}'>\u2578\u2578 model, 90 % band</span>"
+            f"<span style='color:{theme.model}'>\u2578\u2578 model, 90 % band</span>&nbsp;&nbsp; "
+            f"<span style='color:{theme.model}'>\u00b7\u00b7\u00b7 as announced at P<sub>0</sub></span>"
         )
 
     def expect(self, retraction: Array, values: Array) -> None:
@@ -304,7 +353,7 @@ class RetractionPlot(Plot):
 
     def _forget_model(self) -> None:
         self._drawn = None
-        for item in (self.model, self._low, self._high):
+        for item in (self.model, self._low, self._high, self.announced):
             item.setData(_EMPTY, _EMPTY)
         self.point.setData(_EMPTY, _EMPTY)
         self.bars.setData(x=_EMPTY, y=_EMPTY)
@@ -345,20 +394,25 @@ class RetractionPlot(Plot):
         curve = self._drawn
         if curve is None:
             if x.size:
-                self.item.setXRange(float(np.nanmin(x)), float(np.nanmax(x)) + 0.1, padding=0.02)
+                self._set_x(float(np.nanmin(x)), 0.25 * np.ceil(4 * float(np.nanmax(x)) + 0.4))
                 self._fit_y(y)
             return
-        reach = max(float(curve.retraction[-1]), curve.pull_off_distance.high) * self.x.scale
-        seen = [reach * 1.05, min(float(np.nanmax(x)), 1.3 * reach)] if x.size else [reach * 1.05]
-        self.item.setXRange(-0.12 * reach, max(seen), padding=0)
-        model = self._series(curve)
-        inside = y[(x > -0.12 * reach) & (x < max(seen))]
+        first = self._shown[0].predictions[0] if self._shown is not None else curve
+        reach = max(curve.pull_off_distance.high, first.pull_off_distance.high) * self.x.scale
+        low, high = min(-0.1 * reach, float(curve.retraction[0]) * self.x.scale), 0.1 * np.ceil(10.3 * reach)
+        self._set_x(low, high)
+        model = (*self._series(curve), self._series(first)[0])
+        inside = y[(x > low) & (x < high)]
         self._fit_y(inside, *(part * self.y.scale for part in model if part is not None))
 
     def _series(self, prediction: LivePrediction) -> tuple[Array | None, Array | None, Array | None]:
         if self.y is FORCE:
             return prediction.force, prediction.force_low, prediction.force_high
-        return prediction.pressure, prediction.pressure_low, prediction.pressure_high
+        ends = prediction.retraction > prediction.pull_off_distance.value  # what comes after pull-off is no model's
+        return tuple(
+            None if part is None else np.where(ends, np.nan, part)
+            for part in (prediction.pressure, prediction.pressure_low, prediction.pressure_high)
+        )  # type: ignore[return-value]  # three in, three out
 
     def _draw_model(self, prediction: LivePrediction | None) -> None:
         self._forget_model()
@@ -370,10 +424,17 @@ class RetractionPlot(Plot):
         if middle is not None:
             self.model.setData(x, middle * self.y.scale)
         if low is not None and high is not None:
-            self._low.setData(x, low * self.y.scale)
-            self._high.setData(x, high * self.y.scale)
+            known = np.isfinite(low)
+            self._low.setData(x[known], low[known] * self.y.scale)
+            self._high.setData(x[known], high[known] * self.y.scale)
         if self.y is FORCE and middle is not None:
             self._draw_pull_off(prediction)
+        if self._shown is not None and self._shown[0].predictions[0] is not prediction:
+            first = self._shown[0].predictions[0]
+            values = self._series(first)[0]
+            if values is not None:
+                shift = first.zero_height - prediction.zero_height
+                self.announced.setData((first.retraction + shift) * self.x.scale, values * self.y.scale)
 
     def _draw_pull_off(self, prediction: LivePrediction) -> None:
         """A cross at (D_p, -F_p): its arms are the 90 % intervals."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from drivers.interfaces import PumpStatus, StageStatus
 from rig.console.pyramid import Pyramid
 from rig.live import LivePrediction
+from rig.live_data import GONE, TOUCH_N
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan
 from rig.wire import Gap, Message, Samples
 
@@ -186,6 +187,25 @@ class Story:
         if start is None:
             return 0, 0
         return start, min(moment.sample, self.end if stop is None else stop)
+
+    def measured(self, moment: Moment) -> tuple[float, float] | None:
+        """Return F_p (N) and D_p (m) as the samples show them, or ``None`` while the contact holds.
+
+        A first look at the running mean over 20 ms; the analysis of the recording has the last word.
+        """
+        start, stop = self.retraction(moment)
+        window = max(1, int(0.02 * self.rate))
+        blocks = (stop - start) // window
+        if blocks < 2 or np.isnan(moment.zero_height):
+            return None
+        stretch = self.force.values[start : start + blocks * window].reshape(blocks, window)
+        tension = moment.force_zero - stretch.mean(axis=1)
+        peak = int(np.argmax(tension))
+        gone = np.flatnonzero(tension[peak:] < GONE * tension[peak])
+        if not gone.size or tension[peak] < 20 * TOUCH_N:
+            return None
+        last = start + (peak + int(gone[0])) * window
+        return float(tension[peak]), float(self.height.values[last]) - moment.zero_height
 
     def boundaries(self, moment: Moment) -> list[tuple[int, str]]:
         """Return where each step so far began."""

@@ -18,6 +18,7 @@ class Theme:
     line: str
     text: str
     quiet: str
+    faint: str
     measured: str
     model: str
     active: str
@@ -34,6 +35,7 @@ DARK = Theme(
     line="#323c4a",
     text="#f2f5f8",
     quiet="#a3b0bf",
+    faint="#5c6979",
     measured="#56b4e9",
     model="#f0a830",
     active="#56b4e9",
@@ -49,6 +51,7 @@ LIGHT = Theme(
     line="#c3ccd6",
     text="#10161d",
     quiet="#4d5a68",
+    faint="#9aa6b2",
     measured="#0072b2",
     model="#c26a00",
     active="#0072b2",
@@ -88,13 +91,13 @@ def style_sheet(theme: Theme) -> str:
     QLabel#banner {{ background: {theme.fault}; color: {theme.on_fault}; font-size: 18px; font-weight: 600;
                      padding: 10px 14px; border-radius: 8px; }}
     QPushButton, QComboBox, QSpinBox, QToolButton {{
-        background: {theme.card}; border: 1px solid {theme.line}; border-radius: 6px; padding: 6px 12px; }}
+        background: {theme.card}; border: 1px solid {theme.line}; border-radius: 6px; padding: 6px 9px; }}
     QPushButton {{ font-size: 16px; font-weight: 600; min-height: 26px; }}
     QToolButton {{ padding: 2px 8px; color: {theme.quiet}; }}
     QPushButton:hover, QComboBox:hover, QToolButton:hover {{ border-color: {theme.active}; }}
     QPushButton:focus, QComboBox:focus, QSpinBox:focus, QToolButton:focus, QPlainTextEdit:focus, QTableView:focus
         {{ border: 2px solid {theme.active}; }}
-    QPushButton:disabled, QComboBox:disabled, QSpinBox:disabled {{ color: {theme.line}; }}
+    QPushButton:disabled, QComboBox:disabled, QSpinBox:disabled {{ color: {theme.faint}; }}
     QPushButton:checked {{ background: {theme.active}; color: {theme.card}; }}
     QPushButton#emergency {{ background: {EMERGENCY}; color: #ffffff; border: 3px solid #ffffff; border-radius: 10px;
         font-size: 22px; font-weight: 800; padding: 8px 22px; }}
@@ -110,6 +113,11 @@ def style_sheet(theme: Theme) -> str:
     QSlider::groove:horizontal {{ height: 8px; background: {theme.line}; border-radius: 4px; }}
     QSlider::sub-page:horizontal {{ background: {theme.active}; border-radius: 4px; }}
     QSlider::handle:horizontal {{ background: {theme.text}; width: 18px; margin: -6px 0; border-radius: 9px; }}
+    QScrollBar:vertical {{ background: {theme.card}; width: 12px; }}
+    QScrollBar::handle:vertical {{ background: {theme.line}; border-radius: 5px; min-height: 24px; }}
+    QScrollBar::add-line, QScrollBar::sub-line {{ height: 0px; }}
+    QToolButton:checked {{ border-color: {theme.active}; color: {theme.active}; }}
+    QToolTip {{ background: {theme.card}; color: {theme.text}; border: 1px solid {theme.line}; }}
     QMenu {{ background: {theme.card}; border: 1px solid {theme.line}; }}
     QMenu::item:selected {{ background: {theme.active}; color: {theme.card}; }}
     """

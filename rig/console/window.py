@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
     QPlainTextEdit,
     QProgressBar,
     QPushButton,
+    QToolButton,
     QVBoxLayout,
     QWidget,
 )
@@ -49,6 +50,7 @@ from rig.link import Address, Answer, Link, LinkError, running
 from rig.observe import Event, RunInfo
 
 REFRESH_MS = 33
+PICTURES_PER_TEXT = 3
 MESSAGES_PER_REFRESH = 400
 """A console that attaches late catches up over several refreshes and stays usable meanwhile."""
 LOG_LINES = 2000
@@ -92,6 +94,7 @@ class Console(QMainWindow):
         self._timer.timeout.connect(self.refresh)
         self._timer.start(REFRESH_MS)
         self.check()
+        self.controls.run.setFocus()
 
     # ------------------------------------------------------------ construction
 
@@ -180,6 +183,15 @@ class Console(QMainWindow):
         self.log.setFixedHeight(118)
         self.log.setAccessibleName("event log")
         self.log.setTabChangesFocus(True)
+        self.show_commands = QToolButton(self.log)
+        self.show_commands.setText("commands")
+        self.show_commands.setCheckable(True)
+        self.show_commands.setToolTip("Show every command sent to an instrument as well")
+        self.show_commands.setAccessibleName("show commands in the log")
+        self.show_commands.toggled.connect(self._relog)
+        corner = QVBoxLayout(self.log)
+        corner.addWidget(self.show_commands, 0, Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignTop)
+        corner.setContentsMargins(0, 4, 22, 0)
         left = QVBoxLayout()
         left.setSpacing(8)
         left.addWidget(grid([self.force_path, self.force_time], [self.pressure_path, self.pressure_time]), 1)
@@ -506,9 +518,17 @@ class Console(QMainWindow):
             if plot.widget.isVisible():
                 plot.show(story, moment)
         self.strip.show_moment(moment)
+        if self._replaying:
+            self.transport.show_place(sample, story.end, story.rate, playing=self.playhead.playing)
+        if self.frames_painted % PICTURES_PER_TEXT == 0 or moment.ending is not None:
+            self._show_texts(story, moment)
+
+    def _show_texts(self, story: Story, moment: Moment) -> None:
+        """Numbers change ten times a second: faster, nobody reads them, and each change lays the window out anew."""
         self.words.setText(step_words(moment))
         self.readings.show_moment(moment)
-        self.prediction.show_moment(moment)
+        first = story.predictions[0] if story.predictions else None
+        self.prediction.show_moment(moment, first, story.measured(moment))
         self.stage.show_moment(moment)
         self.pump.show_moment(moment)
         self.recording.show_moment(moment, story)
@@ -516,8 +536,6 @@ class Console(QMainWindow):
         self._show_log(story, moment)
         self._show_status(story, moment)
         self._show_state(story, moment)
-        if self._replaying:
-            self.transport.show_place(sample, story.end, story.rate, playing=self.playhead.playing)
 
     def _show_times(self, story: Story, moment: Moment) -> None:
         self.clock.setText(duration(moment.time))
@@ -539,12 +557,19 @@ class Console(QMainWindow):
             self.log.clear()
             shown = 0
         for event in story.events[max(shown, moment.events - LOG_LINES) : moment.events]:
-            self.log.appendPlainText(_line(event, story.rate))
+            if event.kind != "command" or self.show_commands.isChecked():
+                self.log.appendPlainText(_line(event, story.rate))
         if moment.events != shown:
             self.log.verticalScrollBar().setValue(self.log.verticalScrollBar().maximum())
         if story.missed != missed:
             self.log.appendPlainText(f"{story.missed - missed} messages were missed by this console (not by the run)")
         self._log_shown = (moment.events, story.missed)
+
+    def _relog(self) -> None:
+        """Write the log anew."""
+        if self.story is not None:
+            self.log.clear()
+            self._log_shown = (0, self._log_shown[1])
 
     def _show_status(self, story: Story, moment: Moment) -> None:
         prediction = moment.prediction
