@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,7 +46,7 @@ EVENTS = np.dtype([("sample", "<i8"), ("kind", "S12"), ("text", "S400")])
 PREDICTIONS = np.dtype([("sample", "<i8"), ("json", "S16000")])
 ENDING = np.dtype([("reason", "S400"), ("exit_code", "<i4"), ("samples", "<i8"), ("ended", "S40")])
 
-_COMMIT = "frames"
+_NONE = np.empty(0)
 _STAGE_FLAGS = ("moving", "on_target", "servo_on", "negative_limit", "positive_limit")
 _PUMP_STATES = tuple(PumpState)
 
@@ -96,7 +96,8 @@ class Recorder:
     ) -> None:
         self.path = path
         self.acknowledged = 0
-        self._pending: dict[str, list[Any]] = {}
+        self._pending: dict[str, list[NDArray[Any]]] = {}
+        self._frames: list[tuple[Frame, NDArray[np.float64], float]] = []
         self._last_flush = time.perf_counter()
         self._last_pump: PumpStatus | None = None
         try:
@@ -149,19 +150,7 @@ class Recorder:
 
     def append(self, frame: Frame, height: NDArray[np.float64], arrived: float) -> None:
         """Take one frame; it is acknowledged with the next flush."""
-        count = frame.force.size
-        self._put("volts", frame.volts.T)
-        self._put("frames", np.array([(frame.start, count, arrived)], FRAMES))
-        self._put("stage", np.array([pack_stage(frame.stage)], STAGE))
-        self._put("time", np.arange(frame.start, frame.stop) / frame.rate)
-        self._put("force", frame.force)
-        self._put("height", height)
-        if frame.pressure is not None:
-            self._put("pressure", frame.pressure)
-        if frame.pump is not None and frame.pump is not self._last_pump:
-            self._last_pump, pump = frame.pump, frame.pump
-            state = _PUMP_STATES.index(pump.state)
-            self._put("pump", np.array([(frame.stop, pump.sent, pump.received, state, pump.rate, pump.volume)], PUMP))
+        self._frames.append((frame, height, arrived))
         if time.perf_counter() - self._last_flush >= FLUSH_SECONDS:
             self.flush()
 
@@ -200,16 +189,44 @@ class Recorder:
             The disk is full or gone; what was acknowledged before stays readable.
         """
         try:
-            for name in sorted(self._pending, key=_COMMIT.__eq__):  # the frames' table goes last: it commits the rest
-                _extend(self._sets[name], self._pending[name])
+            for name, blocks in self._pending.items():
+                _extend(self._sets[name], np.concatenate(blocks))
+            if self._frames:
+                self._write_frames([frame for frame, _, _ in self._frames])
         except (OSError, RuntimeError) as error:
             raise FileError(
                 f"recording {self.path}: writing failed after {self.acknowledged} samples ({error}). "
                 "Remedy: free space on the disk; what was written stays readable."
             ) from error
-        self.acknowledged += sum(len(block) for block in self._pending.get("force", ()))
+        if self._frames:
+            self.acknowledged = self._frames[-1][0].stop
         self._pending.clear()
+        self._frames.clear()
         self._last_flush = time.perf_counter()
+
+    def _write_frames(self, frames: list[Frame]) -> None:
+        """Write the frames pending; their table goes last: it commits the rest."""
+        write = {
+            "volts": np.concatenate([frame.volts for frame in frames], axis=1).T,
+            "time": np.arange(frames[0].start, frames[-1].stop) / frames[0].rate,
+            "force": np.concatenate([frame.force for frame in frames]),
+            "height": np.concatenate([height for _, height, _ in self._frames]),
+            "stage": np.array([pack_stage(frame.stage) for frame in frames], STAGE),
+            "pump": np.array(list(self._pump_polls(frames)), PUMP),
+            "pressure": np.concatenate([frame.pressure for frame in frames if frame.pressure is not None] or [_NONE]),
+            "frames": np.array([(frame.start, frame.force.size, at) for frame, _, at in self._frames], FRAMES),
+        }
+        for name, block in write.items():
+            if len(block):
+                _extend(self._sets[name], block)
+
+    def _pump_polls(self, frames: list[Frame]) -> Iterator[tuple[Any, ...]]:
+        """Yield each poll of the pump once, with the frame it came with."""
+        for frame in frames:
+            if frame.pump is not None and frame.pump is not self._last_pump:
+                self._last_pump, pump = frame.pump, frame.pump
+                state = _PUMP_STATES.index(pump.state)
+                yield frame.stop, pump.sent, pump.received, state, pump.rate, pump.volume
 
     def close(self) -> None:
         """Flush and close; a closed recorder closes again without effect."""
@@ -246,8 +263,7 @@ def _rows(
     return dataset
 
 
-def _extend(dataset: h5py.Dataset, blocks: list[NDArray[Any]]) -> None:
-    block = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+def _extend(dataset: h5py.Dataset, block: NDArray[Any]) -> None:
     size = dataset.shape[0]
     dataset.resize(size + len(block), axis=0)
     dataset[size:] = block
