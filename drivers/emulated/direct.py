@@ -31,7 +31,7 @@ from drivers.errors import (
 from drivers.interfaces import Clock, Identity, StageStatus, Volts
 
 if TYPE_CHECKING:
-    from drivers.daq import Channel
+    from drivers.daq_channels import Channel
 
 STOPPED = 10
 MOTION_ERRORS = (-1024,)

@@ -90,7 +90,7 @@ class RigidPunch:
     strength: float = 14e3
     tilt: float = 2e-3
 
-    _SCAN = 40
+    _SCAN = 1000
 
     def step(
         self,
@@ -145,7 +145,7 @@ class RigidPunch:
             if abs(here - start) > 20 * abs(stride) and self._edge(edge, here) <= -1.0:
                 return height  # nothing holds any more
         near, far = here, here + stride
-        for _ in range(60):
+        for _ in range(30):
             middle = 0.5 * (near + far)
             near, far = (middle, far) if excess(middle) * begin > 0.0 else (near, middle)
         return 0.5 * (near + far)
