@@ -258,7 +258,7 @@ def test_two_tasks_cannot_run_on_one_device(options: GrpcSessionOptions, task: n
 def test_a_client_that_has_died_loses_the_device(
     server: EmulatedDaq, world: SignalWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.emulated.daq._LEASE", 0.0)
+    monkeypatch.setattr("drivers.emulated.daq_service._LEASE", 0.0)
     dead = connect(server)
     dead.read(10)
     with connect(server) as alive:
