@@ -5,7 +5,7 @@ import time
 
 import pytest
 import serial
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_world import MotionWorld
 
@@ -323,6 +323,7 @@ def test_restart(host, world):
     assert not world.syringe.rate
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=100))
 def test_no_bytes_upset_the_pump(data):
     host = Host(EmulatedLegato(MotionWorld()))
@@ -342,6 +343,7 @@ COMMANDS = st.lists(
 )
 
 
+@settings(deadline=None)
 @given(COMMANDS)
 def test_no_sequence_of_commands_upsets_the_pump(commands):
     world = MotionWorld()

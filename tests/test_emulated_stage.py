@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_world import MotionWorld
 
@@ -355,6 +355,7 @@ def test_commands_are_counted(host):
     assert host.controller.received["unknown"] == 1
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_no_bytes_upset_the_controller(data):
     host = Host(EmulatedController(MotionWorld(), referenced=True, reboot_time=0))
@@ -371,6 +372,7 @@ LINES = st.lists(
 )
 
 
+@settings(deadline=None)
 @given(LINES)
 def test_no_sequence_of_commands_upsets_the_controller(lines):
     world = MotionWorld()

@@ -4,7 +4,7 @@ import contextlib
 
 import pytest
 from dialogue import dialogue
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import BadReply, CommandRefused, MotionFault, NoReply, OutOfRange, WrongDevice
@@ -261,6 +261,7 @@ def test_replies(data, lines, state):
     assert parse_reply(data) == Reply(lines, state)
 
 
+@settings(deadline=None)
 @given(st.binary())
 def test_any_bytes_are_a_reply_or_a_value_error(data):
     try:
@@ -270,6 +271,7 @@ def test_any_bytes_are_a_reply_or_a_value_error(data):
     assert all(line.isprintable() for line in reply.lines)
 
 
+@settings(deadline=None)
 @given(st.text())
 def test_any_text_is_a_quantity_or_a_value_error(text):
     with contextlib.suppress(ValueError):
@@ -300,6 +302,7 @@ def test_quantities_for_the_pump(volume, text):
     assert format_quantity(volume) == text
 
 
+@settings(deadline=None)
 @given(st.floats(1e-14, 1e-3))
 def test_quantities_survive_the_way_to_the_pump_without_exponent(volume):
     below, above = format_quantity(volume), format_quantity(volume, up=True)

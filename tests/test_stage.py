@@ -460,13 +460,14 @@ def connect(replies):
         return PIStage("fake")
 
 
+@settings(deadline=None)
 @given(REPLIES)
 def test_connecting_to_nonsense_is_a_device_error(replies):
     with pytest.raises(DeviceError):
         connect(replies)
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(REPLIES, CALLS)
 def test_nonsense_in_operation_is_a_device_error_or_a_finite_position(replies, calls):
     stage = connect(GOOD_START + replies)
@@ -481,6 +482,7 @@ def test_nonsense_in_operation_is_a_device_error_or_a_finite_position(replies, c
                 assert abs(result.position) < float("inf")
 
 
+@settings(deadline=None)
 @given(st.floats())
 def test_no_float_leaves_the_travel(position):
     stage = connect([*GOOD_START, b"", b"0\n"])

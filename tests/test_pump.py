@@ -1,0 +1,454 @@
+"""The pump driver against the emulated pump, over TCP and a pseudo-terminal, and against nonsense."""
+
+import contextlib
+import sys
+import threading
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_world import MotionWorld
+
+import drivers.pump
+from drivers.emulated.pump import EmulatedLegato
+from drivers.emulated.server import serve_pty, serve_tcp
+from drivers.emulated.stage import EmulatedController
+from drivers.errors import BadReply, CommandRefused, DeviceError, MotionFault, NoReply, NotConnected, WrongDevice
+from drivers.interfaces import PumpState
+from drivers.pump import LegatoPump
+
+PTY = pytest.param(serve_pty, marks=pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX"))
+
+
+def connect(url, **options):
+    settings = {"syringe_diameter": 14.43e-3, "force_percent": 50, "settle": 0.0, "reply_timeout": 0.2, **options}
+    return LegatoPump(url, **settings)
+
+
+@pytest.fixture
+def world():
+    return MotionWorld()
+
+
+@pytest.fixture
+def legato(world):
+    return EmulatedLegato(world)
+
+
+@pytest.fixture
+def server(legato):
+    with serve_tcp(legato) as server:
+        yield server
+
+
+@pytest.fixture
+def pump(server):
+    pump = connect(server.url)
+    yield pump
+    pump.close()
+
+
+@pytest.mark.parametrize("serve", [serve_tcp, PTY])
+@pytest.mark.parametrize("fragment", [None, 1])
+def test_runs_there_and_back(world, legato, serve, fragment):
+    with serve(legato, fragment=fragment) as server:
+        pump = connect(server.url, clock=lambda: world.time, reply_timeout=1.0)
+        assert pump.status().state is PumpState.IDLE
+        pump.dispense(-300e-9, 100e-9)
+        world.pass_time(1)
+        status = pump.status()
+        assert (status.state, status.sent) == (PumpState.WITHDRAWING, world.time)
+        assert status.rate == pytest.approx(-100e-9)
+        assert status.volume == pytest.approx(-100e-9)
+        world.pass_time(3)
+        assert pump.status().state is PumpState.TARGET_REACHED
+        pump.dispense(200e-9, 100e-9)
+        world.pass_time(1)
+        assert pump.status().volume == pytest.approx(-200e-9)
+        world.pass_time(2)
+        status = pump.status()
+        assert (status.state, status.rate) == (PumpState.TARGET_REACHED, 0)
+        assert status.volume == world.syringe.volume == pytest.approx(-100e-9)
+        pump.close()
+
+
+def test_a_run_replaces_one_that_is_under_way(pump, world):
+    pump.dispense(300e-9, 100e-9)
+    world.pass_time(1)
+    pump.dispense(-50e-9, 50e-9)
+    world.pass_time(5)
+    assert pump.status().volume == pytest.approx(50e-9)
+
+
+def test_volume_counts_from_the_connection(pump, server, world):
+    pump.dispense(100e-9, 100e-9)
+    world.pass_time(2)
+    pump.close()
+    again = connect(server.url)
+    assert again.status().volume == 0
+    again.close()
+
+
+def test_connecting_stops_a_pump_that_runs(world, legato, server):
+    legato.execute("load qs iw")
+    legato.execute("irun")
+    assert world.syringe.rate
+    connect(server.url).close()
+    assert not world.syringe.rate
+
+
+def test_nothing_is_written_to_the_memory_that_wears_out(pump, legato, world):
+    for volume in (1e-9, -2e-9, 3e-9):
+        pump.dispense(volume, 10e-9)
+        world.pass_time(1)
+        pump.status()
+    assert legato.nvram_writes == 0
+
+
+def test_firmware_that_knows_nvram_none_only(world):
+    legato = EmulatedLegato(world, nvram_words=("none", "on"))
+    with serve_tcp(legato) as server:
+        connect(server.url).close()
+    assert legato.nvram_writes == 0
+
+
+def test_a_pump_left_echoing_and_unpolled(world, legato, server):
+    legato.execute("echo on")
+    pump = connect(server.url)
+    assert pump.status().state is PumpState.IDLE
+    assert not legato.echoes
+    pump.close()
+
+
+def test_an_addressed_pump(world):
+    with serve_tcp(EmulatedLegato(world, address=7)) as server:
+        pump = connect(server.url, address=7)
+        assert pump.status().state is PumpState.IDLE
+        pump.close()
+        with pytest.raises(NoReply):
+            connect(server.url, address=8)
+
+
+def test_rates_reach_to_both_limits(pump, world):
+    for rate in pump.rate_limits:
+        pump.dispense(1e-9, rate)
+        assert pump.status().rate == pytest.approx(rate, rel=1e-4)
+
+
+def test_every_rate_between_the_limits_is_accepted(pump):
+    low, high = pump.rate_limits
+    for step in range(40):
+        pump.dispense(-123.456789e-9, low * (high / low) ** (step / 39))
+
+
+def test_stop(pump, world):
+    pump.dispense(300e-9, 100e-9)
+    world.pass_time(1)
+    pump.stop()
+    assert not world.syringe.rate
+    status = pump.status()
+    assert (status.state, status.rate) == (PumpState.IDLE, 0)
+    assert status.volume == pytest.approx(100e-9)
+
+
+def test_stop_does_not_queue_behind_a_transaction_that_waits(world, legato, server):
+    pump = connect(server.url, reply_timeout=30)
+    pump.dispense(1e-6, 100e-9)
+    world.fail("pump", "slow", 30)
+
+    def wait():
+        with contextlib.suppress(DeviceError):
+            pump.status()
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    wait_until(lambda: legato.received["status"] > 0)
+    stopping = threading.Thread(target=wait_for_stop, args=(pump,))
+    stopping.start()
+    wait_until(lambda: not world.syringe.rate)
+    assert waiting.is_alive()
+    world.fail("pump", "unplugged")
+    pump._port.write(b"\r")
+    waiting.join()
+    stopping.join()
+    pump.close()
+
+
+def wait_for_stop(pump):
+    with contextlib.suppress(DeviceError):
+        pump.stop()
+
+
+def test_stops_from_another_thread_never_mix_up_replies(pump, world):
+    done = threading.Event()
+
+    def stop():
+        for _ in range(100):
+            pump.stop()
+        done.set()
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    while not done.is_set():
+        low, high = pump._read_limits()
+        assert low < high
+        assert pump.status().state is PumpState.IDLE
+    thread.join()
+    assert not pump._awaited
+
+
+def test_stall(pump, world):
+    pump.dispense(300e-9, 100e-9)
+    world.fail("pump", "stalled")
+    assert pump.status().state is PumpState.STALLED
+    pump.dispense(300e-9, 100e-9)
+    assert pump.status().state is PumpState.STALLED
+    assert world.syringe.volume == 0
+    world.faults.clear()
+    pump.dispense(300e-9, 100e-9)
+    assert pump.status().state is PumpState.INFUSING
+
+
+def test_end_of_the_syringe(world):
+    with serve_tcp(EmulatedLegato(world, capacity=2e-6, fill=1e-6)) as server:
+        pump = connect(server.url)
+        pump.dispense(1.5e-6, 500e-9)
+        world.pass_time(5)
+        assert pump.status().state is PumpState.AT_LIMIT
+        with pytest.raises(CommandRefused, match="Limit switch"):
+            pump.dispense(1e-6, 500e-9)
+        pump.dispense(-1e-6, 500e-9)
+        pump.close()
+
+
+def test_the_stage_on_the_pumps_port(world):
+    with serve_tcp(EmulatedController(world)) as server, pytest.raises((NoReply, WrongDevice), match="'ver'"):
+        connect(server.url, reply_timeout=0.05)
+
+
+def test_another_pump(world):
+    with serve_tcp(EmulatedLegato(world, family="Elite")) as server, pytest.raises(WrongDevice, match="ELITE"):
+        connect(server.url)
+
+
+@pytest.mark.parametrize("name", ["socket://127.0.0.1:1", "socket://", "socket://x:y", "/dev/nowhere", ""])
+def test_impossible_ports(name):
+    with pytest.raises(NotConnected, match=r"cannot open .* Remedy"):
+        connect(name)
+
+
+def test_a_second_program_is_refused(pump, server):
+    with pytest.raises((NotConnected, NoReply)):
+        connect(server.url)
+    assert pump.status().state is PumpState.IDLE
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")
+def test_a_second_program_on_the_serial_port_is_refused(legato):
+    with serve_pty(legato) as server:
+        pump = connect(server.url)
+        with pytest.raises(NotConnected, match="exclusively lock"):
+            connect(server.url)
+        pump.close()
+
+
+def test_closing_twice_and_using_it_afterwards(pump):
+    pump.close()
+    pump.close()
+    for call in (pump.status, pump.stop):
+        with pytest.raises(NotConnected):
+            call()
+
+
+# ---------------------------------------------------------------- faults
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "error"),
+    [
+        ("silent", 0, NoReply),
+        ("slow", 1.0, NoReply),
+        ("late", 0, NoReply),
+        ("garbage", 0, (BadReply, NoReply)),
+        ("unplugged", 0, NotConnected),
+        ("error", 0, CommandRefused),
+        ("target_early", 0, MotionFault),
+    ],
+)
+def test_every_fault_becomes_one_clear_error(pump, world, kind, value, error):
+    pump.dispense(300e-9, 100e-9)
+    world.pass_time(0.5)
+    world.fail("pump", kind, value)
+    with pytest.raises(error, match=r"^pump: .+ Remedy: .+"):
+        pump.status()
+
+
+@pytest.mark.parametrize("kind", ["error", "target_early", "touched", "stalled", "wrong_syringe", "late", "restarted"])
+def test_stop_works_whatever_ails_the_pump(pump, world, kind):
+    pump.dispense(300e-9, 100e-9)
+    world.pass_time(0.5)
+    world.fail("pump", kind)
+    with contextlib.suppress(NoReply):
+        pump.stop()
+    assert not world.syringe.rate
+
+
+@pytest.mark.parametrize("kind", ["silent", "slow", "garbage"])
+def test_stop_reaches_a_pump_whose_replies_go_astray(pump, world, kind):
+    pump.dispense(300e-9, 100e-9)
+    world.fail("pump", kind)
+    with contextlib.suppress(NoReply, BadReply):
+        pump.stop()
+    wait_until(lambda: not world.syringe.rate)
+
+
+def test_a_touched_screen_is_overcome(pump, world):
+    pump.dispense(300e-9, 100e-9)
+    world.fail("pump", "touched")
+    assert pump.status().state is PumpState.INFUSING
+
+
+def test_a_diameter_changed_at_the_screen_is_noticed_before_the_next_run(pump, world):
+    world.fail("pump", "wrong_syringe", 10.0)
+    with pytest.raises(MotionFault, match="10 mm"):
+        pump.dispense(300e-9, 100e-9)
+    assert not world.syringe.rate
+
+
+def test_a_diameter_that_cannot_be_set_is_noticed_on_connection(world, server):
+    world.fail("pump", "wrong_syringe", 10.0)
+    with pytest.raises(MotionFault, match="10 mm"):
+        connect(server.url)
+
+
+def test_a_pump_that_has_restarted_is_not_run_with_the_settings_it_woke_up_with(world):
+    with serve_tcp(EmulatedLegato(world)) as server:
+        pump = connect(server.url, syringe_diameter=10e-3)
+        world.fail("pump", "restarted")
+        with pytest.raises(DeviceError):
+            pump.dispense(300e-9, 100e-9)
+        assert not world.syringe.rate
+        pump.close()
+
+
+@pytest.mark.parametrize("kind", ["silent", "slow", "late", "garbage"])
+def test_no_stale_reply_is_ever_believed(pump, world, kind):
+    pump.dispense(10e-6, 100e-9)
+    believed = 0
+    for attempt in range(12):
+        if attempt == 1:
+            world.fail("pump", kind, 0.25)
+        if attempt == 4:
+            world.faults.clear()
+        world.pass_time(0.1)
+        try:
+            status = pump.status()
+        except (NoReply, BadReply):
+            continue
+        believed += 1
+        assert status.volume == pytest.approx(world.syringe.volume, rel=1e-6)
+    assert believed >= 5
+
+
+# ---------------------------------------------------------------- nonsense
+
+
+class BabblingPort:
+    """Answers every write with the next of the given replies, at once."""
+
+    def __init__(self, replies):
+        self._replies = iter(replies)
+        self._pending = b""
+
+    def write(self, data):
+        self._pending += next(self._replies, b"")
+
+    def read_until(self, expected, size):
+        data, found, self._pending = self._pending.partition(expected)
+        return (data + found)[:size]
+
+    @property
+    def in_waiting(self):
+        return len(self._pending)
+
+    def read(self, size):
+        data, self._pending = self._pending[:size], self._pending[size:]
+        return data
+
+    def close(self):
+        pass
+
+
+OK = b"\n:\x11"
+VERSION = b"\nLegato 210P 3.0.6\r\n:\x11"
+LIMITS = b"\n25.0404 nl/min to 26.0035 ml/min\r\n:\x11"
+GOOD_START = [b"\n:" + OK + VERSION, OK, VERSION, b"\nFirmware: v3\r\n:\x11", *[OK] * 5, b"\n14.4300 mm\r\n:\x11"]
+GOOD_START += [*[OK] * 4, LIMITS, LIMITS]
+PLAUSIBLE = st.sampled_from(
+    [
+        OK,
+        VERSION,
+        LIMITS,
+        b"\n>\x11",
+        b"\n*\x11",
+        b"\nT*\x11",
+        b"\n14.4300 mm\r\n:\x11",
+        b"\n1 2 3 I...i.\r\n>\x11",
+        b"\n1 2 3 w...wT\r\nT*\x11",
+        b"\n6 ml/min\r\n:\x11",
+        b"\n100 ul\r\n:\x11",
+        b"\nCommand error:\r\n   x\r\n:\x11",
+    ]
+)
+FRAMED = st.binary(max_size=30).map(lambda data: b"\n" + data + b"\r\n:\x11")
+REPLIES = st.lists(st.one_of(PLAUSIBLE, FRAMED, st.binary(max_size=30)), max_size=40)
+CALLS = st.lists(
+    st.sampled_from(
+        [
+            LegatoPump.status,
+            LegatoPump.stop,
+            lambda pump: pump.dispense(100e-9, 100e-9),
+            lambda pump: pump.dispense(-100e-9, 100e-9),
+        ]
+    ),
+    max_size=8,
+)
+
+
+def babble(replies):
+    patch = pytest.MonkeyPatch()
+    with patch.context() as context:
+        context.setattr(drivers.pump, "open_port", lambda connection, baud, timeout: BabblingPort(replies))
+        return connect("fake")
+
+
+@settings(deadline=None)
+@given(REPLIES)
+def test_connecting_to_nonsense_is_a_device_error(replies):
+    with pytest.raises(DeviceError):
+        babble(replies)
+
+
+@settings(max_examples=300, deadline=None)
+@given(REPLIES, CALLS)
+def test_nonsense_in_operation_is_a_device_error_or_a_finite_volume(replies, calls):
+    pump = babble(GOOD_START + replies)
+    for call in calls:
+        try:
+            result = call(pump)
+        except DeviceError as error:
+            assert error.device == "pump"
+            assert error.remedy
+        else:
+            if call is LegatoPump.status:
+                assert abs(result.volume) < float("inf")
+
+
+def wait_until(condition):
+    """Wait for another thread's doing."""
+    for _ in range(10_000):
+        if condition():
+            return
+        time.sleep(1e-3)
+    raise AssertionError("the condition never came true")
