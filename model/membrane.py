@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from model.errors import NotConverged
 from model.membrane_branch import Counter, Line, pinned_state, release_branch
-from model.membrane_contact import ContactStretch, Surface, contact_map
+from model.membrane_contact import Contact, ContactStretch, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
 from model.membrane_equilibrium import solve as solve_states
 from model.membrane_path import Features, Piece, Place, Resolution, features, path, peel_panels, pinned_panels
@@ -132,10 +132,22 @@ def scene(parameters: Parameters, stretch: ContactStretch, *, tension_field: boo
         surface=Surface(curvature),
         gas=_gas(parameters, length, pressure),
         work=membrane.work_of_adhesion / tension,
-        contact=contact_map(stretch),
+        contact=_contact(stretch, Surface(curvature), width),
         tension_field=tension_field,
     )
     return Scene(annulus, start, width, length, tension * length, pressure)
+
+
+def _contact(stretch: ContactStretch, surface: Surface, width: float) -> Contact:
+    if stretch is ContactStretch.LOADING:
+        from model.membrane_loading import loading_contact
+
+        return loading_contact(surface, width)
+    if stretch is ContactStretch.FRICTIONLESS:
+        from model.membrane_sliding import Sliding
+
+        return Sliding()
+    return frozen(stretch)
 
 
 def _gas(parameters: Parameters, length: float, unit: float) -> Gas:
@@ -262,7 +274,7 @@ def _prediction(scaled: Scene, found: Found, empty: Prediction, points: int) -> 
         zero_force_position=zero,
         onset_position=read.onset.height * length,
         detachment_position=detachment,
-        detachment_radius=float(_radius(scaled, read.detachment)),
+        detachment_radius=length * read.detachment.radius,
         adhesion_energy=newton * length * read.energy,
         position=profile["position"],
         retraction=profile["position"] - zero,
@@ -281,11 +293,6 @@ def _prediction(scaled: Scene, found: Found, empty: Prediction, points: int) -> 
     )
 
 
-def _radius(scaled: Scene, place: Place) -> float:
-    a = np.exp(-np.array([place.width]))
-    return scaled.length * float(scaled.annulus.contact(scaled.annulus.surface, a).radius[0])
-
-
 def _jumps(scaled: Scene, pieces: list[Piece]) -> tuple[Jump, ...]:
     newton = -2 * math.pi * scaled.force
     jumps = []
@@ -296,8 +303,8 @@ def _jumps(scaled: Scene, pieces: list[Piece]) -> tuple[Jump, ...]:
         jumps.append(
             Jump(
                 position=right.height * scaled.length,
-                radius_before=_radius(scaled, left),
-                radius_after=_radius(scaled, right),
+                radius_before=scaled.length * left.radius,
+                radius_after=scaled.length * right.radius,
                 force_before=newton * left.pull,
                 force_after=newton * right.pull,
             )
@@ -311,12 +318,10 @@ def _profile(scaled: Scene, pieces: list[Piece], points: int) -> Mapping[str, Ar
     for piece, count in zip(pieces, _shares(pieces, points), strict=True):
         panel = piece.panel
         at = np.linspace(piece.begin, piece.end, count)
-        width = np.full(count, panel.width[0]) if panel.pinned else at
-        contact = scaled.annulus.contact(scaled.annulus.surface, np.exp(-width))
         columns["position"].append(panel.height(at) * scaled.length)
         columns["force"].append(-2 * math.pi * scaled.force * panel.pull(at))
         columns["pressure"].append(scaled.pressure * panel.pressure(at))
-        columns["radius"].append(scaled.length * contact.radius)
+        columns["radius"].append(scaled.length * panel.radius(at))
     return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 

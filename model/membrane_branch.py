@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import NotConverged
-from model.membrane_contact import Surface
+from model.membrane_contact import ContactStretch, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Solved, relative_size, release_slope, shape, solve, strip
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ SMALLEST_CONTACT = 3.9
 LAST_WIDTH = 14.0
 NARROW_STRIP = 0.05
 """Width at which the closed form of the strip starts every solution."""
+WIDE_ANNULUS = 1.0
+"""Width at which a sliding contact is entered."""
 FOLD_RATE = 5.0
 """Logarithmic rate of change at which a line that ends counts as turned: O(1) on a smooth one, unbounded at a fold."""
 LARGEST_SURPRISE = 0.5
@@ -126,19 +128,37 @@ def _raise_load(annulus: Annulus, width: float, closure: Closure, height: float,
 
 
 def _flat_state(flat: Annulus, width: float, counter: Counter, order: int) -> Array | None:
-    """Return the peeling state on a flat without pressure: from a narrow strip to the given width."""
+    """Return the peeling state on a flat without pressure, reached from a narrow strip.
+
+    A contact that slides is entered at a wide annulus: it gives way more than a narrow one can.
+    """
+    stuck = replace(flat, contact=frozen(ContactStretch.UNSTRETCHED))
     narrow = min(width, NARROW_STRIP)
-    solved = counter.note(solve(flat, np.array([narrow]), strip(flat.work, order), iterations=20))
+    solved = counter.note(solve(stuck, np.array([narrow]), strip(flat.work, order), iterations=20))
     if not solved.converged[0]:
         return None
-    if narrow == width:
-        return solved.state
+    if flat.contact.sticks:
+        return _to_width(stuck, narrow, solved.state, width, counter)
+    wide = max(width, WIDE_ANNULUS)
+    state = _to_width(stuck, narrow, solved.state, wide, counter)
+    if state is None:
+        return None
+    solved = counter.note(solve(flat, np.array([wide]), state, iterations=30))
+    return _to_width(flat, wide, solved.state, width, counter) if solved.converged[0] else None
+
+
+def _to_width(flat: Annulus, start: float, state: Array, width: float, counter: Counter) -> Array | None:
+    """Follow the peeling state from one width to another; ``None`` where it ends before."""
+    if start == width:
+        return state
 
     def solve_at(place: float, guess: Array) -> Array | None:
         return _accepted(flat, np.array([place]), guess, Closure.RELEASE, 0.0, counter)
 
-    line = follow(solve_at, narrow, solved.state, width, step=0.2, smallest=1e-4)
-    return line.state[-1:] if line.coordinate[-1] == width else None
+    line = follow(solve_at, start, state, width, step=0.2, smallest=1e-4)
+    if line.coordinate[-1 if width > start else 0] != width:
+        return None
+    return line.state[-1:] if width > start else line.state[:1]
 
 
 def _turned(line: Line, widths: Array) -> bool:

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.membrane_contact import ContactMap, Surface
-from model.membrane_material import energy, respond
+from model.membrane_contact import Contact, EdgeState, Surface
+from model.membrane_material import respond
 
 Array = NDArray[np.float64]
 
@@ -115,14 +115,14 @@ class Gas:
 class Annulus:
     """One scene in scaled units; states are rows (u, Q, p, f) with u = r - R and Q at the nodes.
 
-    ``work`` is the work of adhesion over mu h_0; ``contact`` takes reference radii to the substrate. The rim holds the
+    ``work`` is the work of adhesion over mu h_0; ``contact`` says what holds at the contact line. The rim holds the
     membrane at ``prestretch`` times its reference radius.
     """
 
     surface: Surface
     gas: Gas
     work: float
-    contact: ContactMap
+    contact: Contact
     tension_field: bool = False
     prestretch: float = 1.0
 
@@ -132,7 +132,7 @@ class Closure(Enum):
 
     RELEASE = "the energy release rate equals the work of adhesion"
     HEIGHT = "the rim stands at a given height"
-    FORCE = "the pull on the substrate, over 2 pi, is given"
+    TANGENT = "the membrane leaves the substrate at no angle"
 
 
 class Shape(NamedTuple):
@@ -156,13 +156,13 @@ def shape(annulus: Annulus, width: Array, state: Array) -> Shape:
     return Shape(
         s.R,
         s.r,
-        s.line.height[:, None] + rise @ s.grid.cumulative.T,
+        s.edge.height[:, None] + rise @ s.grid.cumulative.T,
         s.response.stretch,
         s.response.hoop_tension,
         s.height,
         s.volume_change,
-        s.release,
-        s.peel_angle,
+        s.edge.release,
+        s.edge.peel_angle,
     )
 
 
@@ -186,35 +186,20 @@ class _Fields:
         self.N = np.hypot(Q, P)
         self.cosine, self.sine = Q / self.N, P / self.N
         self.response = respond(self.N / self.R, self.r / self.R, tension_field=annulus.tension_field)
-        self._contact_line(u[:, 0], q[:, 0])
+        at_line = EdgeState(self.a, u[:, 0], q[:, 0], self.p, self.f)
+        self.edge = annulus.contact.edge(annulus.surface, at_line, tension_field=annulus.tension_field)
         self.integration = self.width[:, None] * self.grid.weights * self.R
         rise = self.response.stretch * self.sine
-        self.height = self.line.height + (self.integration * rise).sum(axis=1)
-        cap = annulus.surface.cap(self.line.radius)
+        self.height = self.edge.height + (self.integration * rise).sum(axis=1)
+        cap = annulus.surface.cap(self.edge.radius)
         self.volume_change = np.pi * (self.integration * self.r**2 * rise).sum(axis=1) - cap
         self.rim = u[:, -1]
-
-    def _contact_line(self, u: Array, Q: Array) -> None:
-        a = self.a
-        self.line = line = self.annulus.contact(self.annulus.surface, a)
-        self.gap = a + u - line.radius
-        P = 0.5 * self.p * line.radius**2 + self.f
-        N = np.hypot(Q, P)
-        cosine, sine = Q / N, P / N
-        hoop = line.radius / a
-        edge = respond(N / a, hoop, tension_field=self.annulus.tension_field)
-        self.edge_cosine, self.edge_sine, self.edge_stretch = cosine, sine, edge.stretch
-        versine = np.where(cosine > 0, sine**2 / (1 + cosine), 1 - cosine)
-        opening = edge.stretch - line.radius_rate + line.radius_rate * versine - sine * line.height_rate
-        stored = energy(edge.stretch, hoop, tension_field=self.annulus.tension_field)
-        self.release = line.released - stored + N / a * opening
-        self.peel_angle = np.arctan2(P, Q) - np.arctan2(line.height_rate, line.radius_rate)
 
 
 def residual_and_jacobian(
     annulus: Annulus, width: Array, state: Array, closure: Closure, target: Array
 ) -> tuple[Array, Array]:
-    """Return residual (n, m) and Jacobian (n, m, m); ``target`` (n,) is the height or force of the closure."""
+    """Return residual (n, m) and Jacobian (n, m, m); ``target`` (n,) is the height of the closure."""
     s = _Fields(annulus, width, state)
     n, m = state.shape
     order, B, D = s.order, s.grid.values, s.grid.slopes
@@ -223,7 +208,7 @@ def residual_and_jacobian(
     residual = np.empty((n, m))
     residual[:, :order] = s.r_slope - (lam - 1) * c + np.where(c > 0, si**2 / (1 + np.abs(c)), 1 - c)
     residual[:, order : 2 * order] = s.q_slope - w2 + p * r * lam * si
-    residual[:, -4] = s.gap / s.width
+    residual[:, -4] = s.edge.tie
     residual[:, -3] = (s.rim - (annulus.prestretch - 1)) / s.width
 
     # Partial derivatives of X = lambda_1 cos(psi), Y = lambda_1 sin(psi) and w_2 by Q, P and r.
@@ -249,19 +234,21 @@ def residual_and_jacobian(
     by_P = -w_P + pr * Y_P
     J[:, top, -2], J[:, top, -1] = -X_P * half, -X_P
     J[:, low, -2], J[:, low, -1] = by_P * half + r * Y, by_P
-    J[:, -4, 0] = 1 / s.width
+    line = [0, order + 1, -2, -1]
+    J[:, -4, line] = s.edge.tie_by
     J[:, -3, order] = 1 / s.width
 
     partial = _Partial(Y, Y_r, X_P, Y_P, half)
     _gas_row(s, residual, J, partial)
-    if closure is Closure.RELEASE:
-        _release_row(s, residual, J)
-    elif closure is Closure.HEIGHT:
+    if closure is Closure.HEIGHT:
         residual[:, -1] = (s.height - target) / s.width
         J[:, -1] = _height_row(s, partial) / s.width[:, None]
+    elif closure is Closure.RELEASE:
+        residual[:, -1] = s.edge.release - annulus.work
+        J[:, -1, line] = s.edge.release_by
     else:
-        residual[:, -1] = s.f - target
-        J[:, -1, -1] = 1
+        residual[:, -1] = s.edge.tangency
+        J[:, -1, line] = s.edge.tangency_by
     return residual, J
 
 
@@ -276,7 +263,9 @@ class _Partial(NamedTuple):
 
 
 def _height_row(s: _Fields, by: _Partial) -> Array:
-    return _integral_row(s, s.integration * by.r, s.integration, by)
+    row = _integral_row(s, s.integration * by.r, s.integration, by)
+    row[:, 0] += s.edge.gradient
+    return row
 
 
 def _integral_row(s: _Fields, by_r: Array, weight: Array, by: _Partial) -> Array:
@@ -303,17 +292,8 @@ def _gas_row(s: _Fields, residual: Array, J: Array, by: _Partial) -> None:
         residual[:, -2] = s.p * ratio - gas.pressure + gas.atmosphere * (ratio - 1)
         weight = (gas.atmosphere + s.p)[:, None] * (np.pi / gas.volume) * s.integration * s.r
         J[:, -2] = _integral_row(s, weight * (2 * by.Y + s.r * by.r), weight * s.r, by)
+        J[:, -2, 0] += (gas.atmosphere + s.p) * (np.pi / gas.volume) * s.edge.radius**2 * s.edge.gradient
         J[:, -2, -2] += ratio
-
-
-def _release_row(s: _Fields, residual: Array, J: Array) -> None:
-    line = s.line
-    residual[:, -1] = s.release - s.annulus.work
-    by_Q = (s.edge_stretch * s.edge_cosine - line.radius_rate) / s.a
-    by_P = (s.edge_stretch * s.edge_sine - line.height_rate) / s.a
-    J[:, -1, s.order + 1] = by_Q
-    J[:, -1, -2] = by_P * 0.5 * line.radius**2
-    J[:, -1, -1] = by_P
 
 
 class Solved(NamedTuple):
@@ -342,7 +322,8 @@ def solve(
     for _ in range(iterations):
         evaluations += active.size
         part = state[active]
-        residual, jacobian = residual_and_jacobian(annulus, width[active], part, closure, targets[active])
+        with np.errstate(all="ignore"):  # a trial state may lie anywhere; what is not finite is dropped below
+            residual, jacobian = residual_and_jacobian(annulus, width[active], part, closure, targets[active])
         usable = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
         active, part, residual, jacobian = active[usable], part[usable], residual[usable], jacobian[usable]
         step = _newton_step(jacobian, residual)

@@ -37,6 +37,11 @@ def energy(stretch: Array, hoop: Array, *, tension_field: bool = False) -> Array
     return 0.5 * ((stretch - thickness) ** 2 + (hoop - 1) ** 2 * (hoop + 2) / hoop)
 
 
+def tension(stretch: Array, hoop: Array) -> Array:
+    """Return the nominal meridional tension lambda_1 - lambda_1^-3 lambda_2^-2."""
+    return stretch - stretch**-3 * hoop**-2
+
+
 def respond(tension: Array, hoop: Array, *, tension_field: bool = False) -> Response:
     """Return the response to a tension >= 0 and a hoop stretch > 0, arrays of equal shape.
 

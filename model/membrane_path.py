@@ -24,8 +24,8 @@ DEEPEST = 12
 class Panel(NamedTuple):
     """States at Chebyshev points of a coordinate: ln(R_0 / a) where the contact peels, z where it is pinned.
 
-    ``height``, ``pull`` (over 2 pi) and ``pressure`` are series in the coordinate; ``tail`` is the size of their last
-    terms relative to the largest.
+    ``height``, ``pull`` (over 2 pi), ``pressure`` and contact ``radius`` are series in the coordinate;
+    ``tail`` is the size of their last terms relative to the largest.
     """
 
     coordinate: Array
@@ -34,6 +34,7 @@ class Panel(NamedTuple):
     height: Chebyshev
     pull: Chebyshev
     pressure: Chebyshev
+    radius: Chebyshev
     tail: float
     pinned: bool
 
@@ -65,6 +66,11 @@ class Place(NamedTuple):
     def pull(self) -> float:
         """Pull on the substrate, over 2 pi."""
         return float(self.piece.panel.pull(self.coordinate))
+
+    @property
+    def radius(self) -> float:
+        """Contact radius."""
+        return float(self.piece.panel.radius(self.coordinate))
 
     @property
     def width(self) -> float:
@@ -180,9 +186,12 @@ def _panel(
     if not solved.converged.all():
         return None
     height = places if width is not None else shape(annulus, widths, solved.state).height
-    rise, pull, pressure = (_series(values, low, high) for values in (height, solved.state[:, -1], solved.state[:, -2]))
+    radius = annulus.contact.radius(annulus.surface, np.exp(-widths), solved.state[:, 0])
+    rise, pull, pressure, edge = (
+        _series(values, low, high) for values in (height, solved.state[:, -1], solved.state[:, -2], radius)
+    )
     tail = max(_tail(rise), _tail(pull))
-    return Panel(places, widths, solved.state, rise, pull, pressure, tail, width is not None)
+    return Panel(places, widths, solved.state, rise, pull, pressure, edge, tail, width is not None)
 
 
 def _series(values: Array, low: float, high: float) -> Chebyshev:

@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 
 from model.membrane_branch import Counter, release_branch, release_state
-from model.membrane_contact import Contact, ContactStretch, Surface, contact_map
+from model.membrane_contact import ContactStretch, Frozen, Line, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, residual_and_jacobian, shape, solve, strip
+from model.membrane_loading import loading_contact
+from model.membrane_material import energy as stored_energy
+from model.membrane_sliding import Sliding, disc_tension
 
 VENTED = Gas(0.0, 5.8, math.inf, 14.0)
 FLAT = Surface(0.0)
 
 
 def annulus(work, *, gas=VENTED, curvature=0.0, stretch=ContactStretch.PROJECTED, **options):
-    return Annulus(Surface(curvature), gas, work, contact_map(stretch), **options)
+    return Annulus(Surface(curvature), gas, work, frozen(stretch), **options)
 
 
 def boyle(pressure, volume=14.0):
@@ -32,9 +35,10 @@ def state_at(problem, a, order=16):
 @pytest.mark.parametrize("gas", [boyle(-0.057), Gas(0.1, 5.8, math.inf, 14.0)])
 @pytest.mark.parametrize("closure", list(Closure))
 @pytest.mark.parametrize("tension_field", [False, True])
-def test_jacobian_is_the_derivative_of_the_residual(gas, closure, tension_field):
+@pytest.mark.parametrize("contact", [frozen(ContactStretch.EML), Sliding()])
+def test_jacobian_is_the_derivative_of_the_residual(gas, closure, tension_field, contact):
     rng = np.random.default_rng(1)
-    problem = annulus(0.03, gas=gas, curvature=0.27, stretch=ContactStretch.EML, tension_field=tension_field)
+    problem = Annulus(Surface(0.27), gas, 0.03, contact, tension_field=tension_field)
     state = strip(0.03, 6) * (1 + 0.1 * rng.random((1, 16)))
     state[0, :7] += 0.05 * rng.random(7)
     state[0, -2] = -0.05
@@ -111,9 +115,9 @@ def test_pretension_punch_limit():
     def stretched(_: Surface, a):
         zero, one = np.zeros_like(a), np.ones_like(a)
         stored = 0.5 * (2 * prestretch**2 + prestretch**-4 - 3) * one
-        return Contact(prestretch * a, zero, prestretch * one, zero, stored)
+        return Line(prestretch * a, zero, prestretch * one, zero, stored)
 
-    problem = Annulus(FLAT, VENTED, work, stretched, prestretch=prestretch)
+    problem = Annulus(FLAT, VENTED, work, Frozen(stretched), prestretch=prestretch)
     width = np.linspace(0.8, 1.2, 17)
     order = 14
     w1 = prestretch - prestretch**-5
@@ -158,23 +162,27 @@ def test_force_and_release_rate_are_differences_of_the_energy(gas):
 
 def total_energy(problem, width, state):
     """Stretching of annulus and contact plus the work of the gas, over T* R_0^2; adhesion left out."""
+    a = np.exp(-width)
+    radii = a * np.sqrt((np.polynomial.legendre.leggauss(40)[0] + 1) / 2)
+    quadrature = np.polynomial.legendre.leggauss(40)[1] / 2
+    released = problem.contact.line(problem.surface, radii).released
+    return annulus_energy(problem, width, state) + math.pi * a**2 * (quadrature * released).sum()
+
+
+def annulus_energy(problem, width, state):
+    """Stretching of the annulus plus the work of the gas."""
     s = shape(problem, width, state)
     order = s.R.shape[1]
     weights = np.polynomial.legendre.leggauss(order)[1] / 2
     hoop = s.r / s.R
     density = 0.5 * (s.stretch**2 + hoop**2 + (s.stretch * hoop) ** -2 - 3)
     free = 2 * math.pi * (width[:, None] * weights * s.R**2 * density).sum(axis=1)
-    a = np.exp(-width)
-    radii = a * np.sqrt((np.polynomial.legendre.leggauss(40)[0] + 1) / 2)
-    quadrature = np.polynomial.legendre.leggauss(40)[1] / 2
-    released = problem.contact(problem.surface, radii).released
-    contact = math.pi * a**2 * (quadrature * released).sum()
     gas, change = problem.gas, s.volume_change
     if gas.held:
-        return free + contact - gas.pressure * change
+        return free - gas.pressure * change
     ratio = np.log1p(change / gas.free_volume)
     work = gas.atmosphere * change - (gas.atmosphere + gas.pressure) * gas.volume * ratio
-    return free + contact + work
+    return free + work
 
 
 @pytest.mark.parametrize("pressure", [-0.16, -0.05, 0.0, 0.05])
@@ -205,3 +213,111 @@ def test_tension_field_only_removes_energy():
     width, state = state_at(taut, 0.5)
     assert (shape(taut, width, state).hoop_tension > 0).all()
     assert state_at(slack, 0.5)[1] == pytest.approx(state, rel=1e-9, abs=1e-12)
+
+
+def disc_energy(surface, a, radius):
+    """Energy of a sliding disc at held edge: the work 2 pi a q along its spreading, and the frictionless optimum."""
+    points, weights = np.polynomial.legendre.leggauss(12)
+    free = natural_radius(surface, a)
+    spread = free + (radius - free) * (points + 1) / 2
+    tension, _ = disc_tension(surface, np.full(12, a), spread)
+    along = 1 / surface.cosine(spread)  # the traction acts along the meridian
+    return float((radius - free) / 2 * (weights * 2 * math.pi * a * tension * along).sum())
+
+
+def natural_radius(surface, a):
+    """Radius at which a sliding disc carries no edge tension."""
+    low, high = 0.9 * a, a
+    for _ in range(60):
+        middle = (low + high) / 2
+        value = disc_tension(surface, np.array([a]), np.array([middle]))[0][0]
+        low, high = (low, middle) if value >= 0 else (middle, high)  # nan: the edge would be compressed
+    return high
+
+
+def test_sliding_disc_at_small_strain_is_the_frictionless_plate_on_a_sphere():
+    """Small strain, any Poisson's ratio: hoop strain -a^2 / (8 r_b^2) at the free edge, E h a^4 / (384 r_b^4) per area."""
+    a = 0.5
+    strains, energies = [], []
+    for curvature in (0.2, 0.1):
+        surface, slope = Surface(curvature), curvature * a
+        strains.append((natural_radius(surface, a) / a - 1) / slope**2)
+        energies.append(free_disc_energy(surface, a) / (math.pi * a**2) / (3 * slope**4))
+    assert strains == pytest.approx([-1 / 8, -1 / 8], rel=2e-3)
+    assert abs(strains[1] + 1 / 8) < 0.3 * abs(strains[0] + 1 / 8)
+    assert energies == pytest.approx([1 / 384, 1 / 384], rel=2e-2)
+    assert abs(energies[1] - 1 / 384) < 0.3 * abs(energies[0] - 1 / 384)
+
+
+def test_flat_sliding_disc_is_uniformly_stretched():
+    tension, rate = disc_tension(Surface(0.0), np.array([0.5]), np.array([0.55]))
+    nearly, nearly_rate = disc_tension(Surface(1e-3), np.array([0.5]), np.array([0.55]))
+    assert tension == pytest.approx(1.1 - 1.1**-5)
+    assert nearly == pytest.approx(tension, rel=1e-6)
+    assert nearly_rate == pytest.approx(rate, rel=1e-5)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 8 / 30])
+def test_sliding_release_rate_is_the_difference_of_the_energy(curvature):
+    """The jump of Eshelby's energy against d Pi / d A with the disc's own energy, extrapolated."""
+    surface, a, work = Surface(curvature), 0.5, 0.0286
+    problem = Annulus(surface, boyle(-0.03), work, Sliding())
+    start = release_state(problem, -math.log(a), Counter(), 16)
+    assert start.state is not None
+    height = float(shape(problem, np.array([-math.log(a)]), start.state).height[0])
+
+    def energy(radius):
+        width = np.array([-math.log(radius)])
+        solved = solve(problem, width, start.state, closure=Closure.HEIGHT, target=height, iterations=30)
+        assert solved.converged[0]
+        edge = radius + float(solved.state[0, 0])
+        stretched = disc_energy(surface, radius, edge) + free_disc_energy(surface, radius)
+        return float(annulus_energy(problem, width, solved.state)[0]) + stretched
+
+    differences = []
+    for step in (2e-2, 1e-2):
+        area = math.pi * ((a + step) ** 2 - (a - step) ** 2)
+        differences.append((energy(a + step) - energy(a - step)) / area)
+    extrapolated = (4 * differences[1] - differences[0]) / 3
+    assert extrapolated == pytest.approx(work, rel=2e-4)
+
+
+def free_disc_energy(surface, a):
+    """Energy of a disc with a free edge, from the rate at which cutting it smaller sets energy free."""
+    if surface.curvature == 0:
+        return 0.0
+    points, weights = np.polynomial.legendre.leggauss(8)
+    total = 0.0
+    for point, weight in zip(points, weights, strict=True):
+        inner = a * math.sqrt((point + 1) / 2)
+        hoop = np.array([natural_radius(surface, inner) / inner])
+        total += weight / 2 * float(stored_energy(hoop**-0.5, hoop)[0])
+    return math.pi * a**2 * total
+
+
+def test_loading_freezes_nearly_the_projected_stretch():
+    """Vented loading leaves every point within half a per cent of where vertical projection puts it."""
+    surface = Surface(8 / 30)
+    line = loading_contact(surface, -math.log(0.9)).line(surface, np.linspace(0.1, 0.9, 9))
+    assert line.radius == pytest.approx(np.linspace(0.1, 0.9, 9), rel=5e-3)
+    assert line.released == pytest.approx(
+        frozen(ContactStretch.PROJECTED).line(surface, np.linspace(0.1, 0.9, 9)).released, rel=0.7
+    )
+
+
+def test_loading_rate_is_the_stretch_of_the_ring_touched_next():
+    """The frozen map satisfies its own differential equation at a radius that was no collocation point."""
+    surface, a = Surface(8 / 30), np.array([0.613])
+    contact = loading_contact(surface, -math.log(0.9))
+    problem = Annulus(surface, Gas(0.0, 1.0, math.inf, 1.0), 0.0, contact)
+    guess = strip(0.002, 16)
+    guess[:, -1] *= -1
+    solved = solve(problem, -np.log(a), guess, closure=Closure.TANGENT, iterations=40)
+    assert solved.converged[0]
+    s = shape(problem, -np.log(a), solved.state)
+    line = contact.line(surface, a)
+    assert float(s.peel_angle[0]) == pytest.approx(0.0, abs=1e-9)
+    Q = solved.state[0, 17]
+    lam = line.radius_rate / surface.cosine(line.radius)
+    tension = float(np.hypot(Q, solved.state[0, -1]) / a[0])
+    assert float((lam - lam**-3 * (line.radius / a) ** -2)[0]) == pytest.approx(tension, rel=1e-4)
