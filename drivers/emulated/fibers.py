@@ -135,6 +135,8 @@ class RigidPunch:
         def excess(place: float) -> float:
             return place - height - self._force(self._edge(edge, place), place) / stiffness
 
+        if edge <= -1.0 and height >= self.tilt * self.radius:
+            return height
         begin = excess(start)
         if begin == 0.0:
             return start
