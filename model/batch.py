@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from model import cone
 from model.cone_branch import bounds, largest_slope, tilts
+from model.cone_error import SAFETY, rounding
 from model.cone_terms import Cone, Edge, Isothermal, Vented
 from model.errors import NotConverged
 from model.parameters import GasAnchor, Parameters
 from model.prediction import Array, Outcome
-from model.roots import bracketed_many
+from model.roots import EPSILON, bracketed_many
 from model.start import check, start_position, start_radius
 
 if TYPE_CHECKING:
@@ -32,9 +33,10 @@ SETTLED = 1e-7
 """A Newton step this small leaves an error of its square."""
 TOLERANCE = 1e-11
 """Relative width of the bracket of a contact radius; z and F_r are extremal there, or vary with it linearly."""
-BLOCK = 2048
-"""Scenes per vectorised block: small enough for the cache, and fixed, so that results do not depend on the caller."""
+BLOCK = 4096
+"""Scenes per vectorised block; fixed, so that results do not depend on how a sweep is distributed."""
 
+ERRORS = ("pull_off_force", "pull_off_distance")
 FEATURES = (
     "pull_off_force",
     "pull_off_distance",
@@ -59,6 +61,8 @@ class Batch:
     onset_position: Array
     detachment_position: Array
     detachment_radius: Array
+    numerical_error: dict[str, Array]
+    """Absolute errors of F_p and D_p."""
     runtime_s: float
     scalar_scenes: int
     """Scenes solved one by one because their contact jumps or their chamber is special."""
@@ -69,6 +73,7 @@ class Batch:
 
         units = {name: "N" if name.endswith("force") else "m" for name in FEATURES}
         columns = {f"{name}_{unit}": getattr(self, name) for name, unit in units.items()}
+        columns |= {f"{name}_error_{units[name]}": self.numerical_error[name] for name in ERRORS}
         return pd.DataFrame({"outcome": [outcome.value for outcome in self.outcome], **columns})
 
 
@@ -93,6 +98,7 @@ def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, no
     for scene in scenes:
         check(scene)
     features = {name: np.full(len(scenes), np.nan) for name in FEATURES}
+    errors = {name: np.full(len(scenes), np.nan) for name in ERRORS}
     outcome = np.full(len(scenes), Outcome.PULL_OFF, dtype=object)
     alone = [k for k, scene in enumerate(scenes) if not _is_regular(scene)]
     kinds: dict[tuple[bool, bool], list[int]] = {}
@@ -107,16 +113,21 @@ def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, no
             values, solved = _solve_block([scenes[k] for k in block], contact_stretch, nodes)
             for name in FEATURES:
                 features[name][block] = values[name]
+            for name in ERRORS:
+                errors[name][block] = values[name + " error"]
             alone += [k for k, fine in zip(block, solved, strict=True) if not fine]
     for k in alone:
         prediction = cone.solve(scenes[k], contact_stretch=contact_stretch, points=16)
         outcome[k] = prediction.outcome
         for name in FEATURES:
             features[name][k] = getattr(prediction, name)
+        for name in ERRORS:
+            errors[name][k] = prediction.numerical_error.get(name, np.nan)
     return Batch(
         model="cone" if contact_stretch else "cone-2017",
         outcome=outcome,
         runtime_s=time.perf_counter() - begin,
+        numerical_error=errors,
         scalar_scenes=len(alone),
         **features,
     )
@@ -136,7 +147,8 @@ def _solve_block(
 ) -> tuple[dict[str, Array], NDArray[np.bool_]]:
     """Return the features of scenes of one kind and which of them are solved."""
     solved = np.zeros(len(scenes), dtype=bool)
-    values = {name: np.full(len(scenes), np.nan) for name in FEATURES}
+    names = (*FEATURES, *(name + " error" for name in ERRORS))
+    values = {name: np.full(len(scenes), np.nan) for name in names}
     columns = _columns(scenes, contact_stretch)
     opened = np.flatnonzero(_start_volume(columns.cone) > 0).tolist()
     if not opened:
@@ -149,7 +161,7 @@ def _solve_block(
     except NotConverged:
         return values, solved
     solved[opened] = fine
-    for name in FEATURES:
+    for name in names:
         values[name][opened] = features[name]
     return values, solved
 
@@ -275,10 +287,12 @@ class _Refinement:
         """Return the features in SI units and which rows are solved."""
         top = self._fold()
         self._end_at_fold(top)
-        peak_force, peak_position = self._peak(top)
-        zero = self._zero(top)
+        peak_force, peak_position, peak = self._peak(top)
+        zero, crossing = self._zero(top)
         end = top + 1
         detachment, radius = self.position[self.rows, end], self.radius[self.rows, end]
+        force_error = self._rounding(*peak)[0]
+        position_error = self._rounding(radius, self.t[self.rows, end])[1] + crossing
         length, force = self.block.length[:, 0], self.block.force[:, 0]
         self.fine &= np.isfinite(detachment + zero + peak_force)
         return {
@@ -289,7 +303,21 @@ class _Refinement:
             "onset_position": self.position[:, 0] * length,
             "detachment_position": detachment * length,
             "detachment_radius": radius * length,
+            "pull_off_force error": force_error * force,
+            "pull_off_distance error": position_error * length,
         }, self.fine
+
+    def _rounding(self, radius: Array, t: Array) -> tuple[Array, Array]:
+        """Return the rounding errors of F_r and z on the branch, as ``cone_error`` does for one scene."""
+        edge, t = self.cone.edge(radius[:, None]), t[:, None]
+        residual, force, position = rounding(self.cone, edge, t)
+        state = self.cone.state(edge, t)
+        slope = np.where(state.residual_t > 0, residual / state.residual_t, np.abs(t))
+        unit = SAFETY * EPSILON
+        return (
+            column(unit * (force + np.abs(state.force_t) * slope)),
+            column(unit * (position + edge.gap * slope) + np.zeros_like(t)),
+        )
 
     def _fold(self) -> Array:
         """Return the last node before the contact detaches; rows that may jump are left to the scalar solver."""
@@ -317,8 +345,8 @@ class _Refinement:
         self.force[self.rows, after] = np.where(keep, self.force[self.rows, after], force[:, 0])
         self.force_climb[self.rows, after] = np.where(keep, self.force_climb[self.rows, after], force_climb[:, 0])
 
-    def _peak(self, top: Array) -> tuple[Array, Array]:
-        """Return the lowest force up to the fold and its z."""
+    def _peak(self, top: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+        """Return the lowest force up to the fold, its z, and its radius and t."""
         index = np.arange(self.force.shape[1])
         force = np.where(index <= (top + 1)[:, None], self.force, np.inf)
         k = np.argmin(force, axis=1)
@@ -328,6 +356,8 @@ class _Refinement:
         on_left = (self.force_climb[self.rows, left] > 0) & (here < 0) & (left < k)
         on_right = (here > 0) & (self.force_climb[self.rows, right] < 0) & (right > k)
         inner = on_left | on_right
+        hidden = ((here > 0) & (right > k) & ~on_right) | ((here < 0) & (left < k) & ~on_left)
+        self.fine &= ~hidden | inner
         radius, t = self._root(2, np.where(on_left, left, k), np.where(on_left, k, right), inner)
         edge = self.cone.edge(radius[:, None])
         refined = self.cone.state(edge, t[:, None]).force[:, 0]
@@ -335,10 +365,11 @@ class _Refinement:
         return (
             np.where(inner, refined, force[self.rows, k]),
             np.where(inner, self.cone.position(edge, t[:, None])[:, 0], self.position[self.rows, k]),
+            (np.where(inner, radius, self.radius[self.rows, k]), np.where(inner, t, self.t[self.rows, k])),
         )
 
-    def _zero(self, top: Array) -> Array:
-        """Return z where the force first turns tensile: at the start, while pinned, or on the branch."""
+    def _zero(self, top: Array) -> tuple[Array, Array]:
+        """Return z where the force first turns tensile (at the start, pinned or on the branch) and its error."""
         edge, start = self.start_edge, self.cone.start_position[:, 0]
         t_0 = (self.cone.start_position + edge.drop) / edge.gap
         first = (self.cone.state(edge, t_0).force + np.zeros_like(t_0))[:, 0]
@@ -353,16 +384,22 @@ class _Refinement:
             np.where(pinned, self.t[:, 0], 0.0),
             first,
             last,
+            TOLERANCE,
         )
         zero: Array = np.where(at_start, start, self.cone.position(edge, held[:, None])[:, 0])
         moving = ~at_start & ~pinned
+        error = TOLERANCE * np.abs(self.cone.position(edge, held[:, None])[:, 0] - start)
+        error = np.where(pinned, error, 0.0)
         if not moving.any():
-            return zero
+            return zero, error
         k = np.maximum(np.argmax(tensile, axis=1), 1)
         radius, t = self._root(0, k - 1, k, moving)
-        free = self.cone.position(self.cone.edge(radius[:, None]), t[:, None])[:, 0]
+        free_edge = self.cone.edge(radius[:, None])
+        free = self.cone.position(free_edge, t[:, None])[:, 0]
         zero[moving] = free[moving]
-        return zero
+        climb = column(self._slopes(free_edge, t[:, None])[1])
+        error[moving] = (TOLERANCE * radius * np.abs(climb) + self._rounding(radius, t)[1])[moving]
+        return zero, error
 
     def _root(self, which: int, before: Array, after: Array, wanted: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return radius and t where force (0), dz/drho (1) or dF/drho (2) vanishes between two nodes of each row."""

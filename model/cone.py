@@ -23,6 +23,10 @@ NODES = 64
 """Radii at which the branch is scanned for folds; the features themselves are solved to machine precision."""
 
 
+DIGITS_LOST = 1e-10
+"""Relative rounding error of F_p from which on a prediction warns."""
+
+
 class Scales(NamedTuple):
     """What the dimensionless quantities are multiplied with, SI."""
 
@@ -88,6 +92,7 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
     profile = sample(branch, path, (zero, peak), points)
     detachment = path.detachment
     length, force = scales.length, scales.force
+    errors = of_features(branch, zero, peak, detachment)
     return Prediction(
         name,
         Outcome.PULL_OFF,
@@ -108,21 +113,25 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         stable=np.ones(len(profile.radius), dtype=bool),
         jumps=tuple(_jumps(path, scales)),
         numerical_error={
-            name: error * (force if name == "pull_off_force" else length)
-            for name, error in of_features(branch, zero, peak, detachment).items()
+            name: error * (force if name == "pull_off_force" else length) for name, error in errors.items()
         },
         runtime_s=time.perf_counter() - begin,
         evaluations=cone.evaluations,
-        warnings=_warnings(cone, height),
+        warnings=_warnings(cone, height, errors["pull_off_force"] / -peak.force),
     )
 
 
-def _warnings(cone: Cone, height: float) -> tuple[str, ...]:
+def _warnings(cone: Cone, height: float, relative_error: float) -> tuple[str, ...]:
     """Return what the reader of a prediction ought to know."""
+    warnings = []
     edge = cone.start_edge
-    if cone.sphere is None or edge.gap == 0 or cone.residual(edge, height / edge.gap)[0] <= 0:
-        return ()
-    return ("at z_0 the cone would cut into the sphere; the contact is taken as held at r_i until it clears it",)
+    if cone.sphere is not None and edge.gap > 0 and cone.residual(edge, height / edge.gap)[0] > 0:
+        warnings.append(
+            "at z_0 the cone would cut into the sphere; the contact is taken as held at r_i until it clears"
+        )
+    if relative_error > DIGITS_LOST:
+        warnings.append(f"F_p is a small difference of large forces: relative rounding error {relative_error:.1e}")
+    return tuple(warnings)
 
 
 def nondimensional(parameters: Parameters, contact_stretch: bool) -> tuple[Cone, Scales]:
@@ -198,25 +207,26 @@ def sample(branch: Branch, path: Path, marks: tuple[Point, ...], points: int) ->
     pinned, stretches = path.pinned, path.stretches
     whole = path.detachment.position - pinned.first.position
     share = (pinned.last.position - pinned.first.position) / whole if whole > 0 else 0.0
-    held = max(2, round((points - len(marks)) * min(share, 0.5)))
-    free = max(points - len(marks) - held, 2 * len(stretches))
-    t = np.linspace(pinned.first.t, pinned.last.t, held + 1)[:-1]
-    edge = cone.edge(np.full(held, cone.start_radius))
-    held_state = cone.state(edge, t)
-    held_position = cone.position(edge, t)
-    radius = np.concatenate(
-        [
-            np.linspace(stretch.first.radius, stretch.last.radius, max(2, free // len(stretches)))
-            for stretch in stretches
-        ]
-    )
-    free_edge = cone.edge(radius)
-    state, free_t = settled_state(cone, free_edge, branch.guess(radius))
+    inner = points - len(marks)
+    held = max(2, round(inner * min(share, 0.5)))
+    ends = np.linspace(held, inner, len(stretches) + 1).astype(int)
+    radius, t = np.empty(inner), np.empty(inner)
+    radius[:held] = cone.start_radius
+    t[:held] = np.linspace(pinned.first.t, pinned.last.t, held + 1)[:-1]
+    for stretch, first, last in zip(stretches, ends, ends[1:], strict=False):
+        radius[first:last] = np.linspace(stretch.first.radius, stretch.last.radius, last - first)
+    t[held:] = branch.guess(radius[held:])
+    edge = cone.edge(radius)
+    state, t = settled_state(cone, edge, t, held)
+    position = cone.position(edge, t)
+    order = np.argsort(np.concatenate((position, [mark.position for mark in marks])), kind="stable")
+    marked = [(mark.radius, mark.position, mark.force, cone.pressure(cone.edge(mark.radius), mark.t)) for mark in marks]
+    columns = (radius, position, state.force, state.pressure + np.zeros(inner))
     return Profile(
-        np.concatenate((edge.radius, radius)),
-        np.concatenate((held_position, cone.position(free_edge, free_t))),
-        np.concatenate((held_state.force, state.force)),
-        np.concatenate((held_state.pressure + np.zeros(held), state.pressure + np.zeros(radius.size))),
+        *(
+            np.concatenate((column, extra))[order]
+            for column, extra in zip(columns, zip(*marked, strict=True), strict=True)
+        )
     )
 
 

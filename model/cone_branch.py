@@ -92,16 +92,21 @@ def _free_newton(cone: Cone, edge: Edge, t: Array, accuracy: float) -> Array | N
     return None
 
 
-def settled_state(cone: Cone, edge: Edge, t: Array) -> tuple[State, Array]:
-    """Return state and t from a close start: the last Newton step corrects the force to first order."""
+def settled_state(cone: Cone, edge: Edge, t: Array, held: int) -> tuple[State, Array]:
+    """Return state and t from a close start; the first ``held`` points are pinned and keep their t.
+
+    The last Newton step corrects the force to first order.
+    """
     with np.errstate(all="ignore"):
         for _ in range(5):
             state = cone.state(edge, t)
-            step = np.where(state.residual == 0, 0.0, state.residual / state.residual_t)
+            step = state.residual / state.residual_t
+            step[:held] = 0.0
+            step[state.residual == 0] = 0.0
             t = t - step
-            if (np.abs(step) <= SETTLED * (np.abs(t) + edge.slope)).all() and (t + edge.slope >= 0).all():
+            if (np.abs(step) <= SETTLED * (np.abs(t) + edge.slope)).all() and (t + edge.slope >= 0)[held:].all():
                 return state._replace(force=state.force - state.force_t * step), t
-    t = largest_slope(cone, edge)
+    t = np.concatenate((t[:held], largest_slope(cone, edge)[held:]))
     return cone.state(edge, t), t
 
 
@@ -223,7 +228,7 @@ class Branch:
         start = self.cone.state(edge, 0.0)
         if not start.pressure > 0:
             return 0.0
-        high = float(bounds(self.cone, Edge(*(np.array([part]) for part in edge)))[1][0])
+        high = 1.1 * abs(float(self.t[-1])) + EPSILON
         while (end := self.cone.state(edge, high).force) > 0:
             high *= 2
         return bracketed(lambda t: self.cone.state(edge, t).force, 0.0, high, start.force, end)

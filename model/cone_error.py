@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from model.cone_branch import Branch, Point, tilt_of
-from model.cone_terms import Cone, Driven, Edge, Isothermal, stretch_energy
+from model.cone_terms import Cone, Driven, Edge, Isothermal, Number, stretch_energy
 from model.prediction import Array
 from model.roots import EPSILON
 
@@ -26,7 +26,7 @@ class Uncertainty(NamedTuple):
     force: float
 
 
-def rounding(cone: Cone, edge: Edge, t: float) -> tuple[float, float, float]:
+def rounding(cone: Cone, edge: Edge, t: Number) -> tuple[Number, Number, Number]:
     """Return the summed magnitudes of the terms of residual, force and position."""
     energy, energy_t, _ = stretch_energy(t)
     tau = abs(t) + edge.slope
@@ -40,14 +40,14 @@ def rounding(cone: Cone, edge: Edge, t: float) -> tuple[float, float, float]:
     return residual, force, edge.gap * abs(t) + edge.drop + edge.slope * radius
 
 
-def pressure_terms(cone: Cone, edge: Edge, t: float) -> float:
+def pressure_terms(cone: Cone, edge: Edge, t: Number) -> Number:
     """Return the summed magnitudes of the terms of the gauge pressure."""
     gas = cone.gas
     if not isinstance(gas, Isothermal):
-        return float(abs(gas.at(cone.position(edge, t))[0] if isinstance(gas, Driven) else gas.initial))
+        return abs(gas.at(cone.position(edge, t))[0] if isinstance(gas, Driven) else gas.initial)
     change = cone.growth(edge, t) + gas.offset
     terms = edge.gap * abs(t) * (1 + edge.radius + edge.radius**2) + edge.cap + abs(gas.offset)
-    return float((abs(gas.initial) * gas.anchor + gas.atmosphere * terms) / (gas.anchor + change))
+    return (abs(gas.initial) * gas.anchor + gas.atmosphere * terms) / (gas.anchor + change)
 
 
 def on_branch(branch: Branch, point: Point) -> Uncertainty:

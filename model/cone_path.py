@@ -9,7 +9,7 @@ import numpy as np
 
 from model.cone_branch import Branch, Point
 from model.cone_terms import Driven
-from model.roots import bracketed
+from model.roots import EPSILON, bracketed
 
 PINNED_NODES = 33
 
@@ -121,8 +121,19 @@ def zero_of_force(branch: Branch, path: Path) -> Point | None:
 
 
 def _pinned_zero(branch: Branch, before: Point, after: Point) -> Point:
-    cone = branch.cone
-    edge = cone.start_edge
+    """Return the zero of the force while the contact is held: Newton's steps, or bisection where they leave."""
+    cone, edge = branch.cone, branch.cone.start_edge
+    t = after.t
+    for _ in range(20):
+        state = cone.state(edge, t)
+        if not state.force_t < 0:
+            break
+        step = state.force / state.force_t
+        t -= step
+        if not before.t <= t <= after.t:
+            break
+        if abs(step) <= 4 * EPSILON * abs(t):
+            return _pinned_point(branch, t)
     t = bracketed(lambda t: cone.state(edge, t).force, before.t, after.t, before.force, after.force)
     return _pinned_point(branch, t)
 
@@ -142,8 +153,21 @@ def _strongest_of(branch: Branch, stretch: Stretch) -> Point:
     lowest = min(range(len(points)), key=lambda k: points[k].force)
     around = range(max(lowest - 1, 0), min(lowest + 1, len(points) - 1) + 1)
     best = points[lowest]
-    for k in around[:-1]:
-        if points[k].force_climb > 0 > points[k + 1].force_climb:
-            inner = branch.lowest_force(points[k], points[k + 1])
-            best = min(best, inner, key=lambda point: point.force)
+    for before, after in itertools.pairwise(points[k] for k in around):
+        if before.force_climb > 0 and (after.force_climb <= 0 or after.force >= before.force):
+            beyond = _past_minimum(branch, before, after)
+            if beyond.force_climb < 0:
+                best = min(best, branch.lowest_force(before, beyond), key=lambda point: point.force)
     return best
+
+
+def _past_minimum(branch: Branch, before: Point, after: Point) -> Point:
+    """Return a point where the force rises again: ``after``, or one nearer if it falls at both ends but not between."""
+    for _ in range(30):
+        if after.force_climb < 0:
+            return after
+        middle = branch.point((before.radius + after.radius) / 2)
+        if middle.force_climb < 0:
+            return middle
+        before, after = (middle, after) if middle.force < before.force else (before, middle)
+    return after

@@ -222,15 +222,16 @@ class Cone:
         return State(
             residual + tau * (outer * energy_t - pull),
             edge.gap * energy_t - pull + tau * (outer * energy_tt - edge.lever * pressure_t),
-            residual_radius
-            - pressure * (1 - 4 * radius) * tau
-            - pull * curvature
-            - pressure_radius * edge.lever * tau,
+            residual_radius - pressure * (1 - 4 * radius) * tau - pull * curvature - pressure_radius * edge.lever * tau,
             pressure * edge.area - outer * energy_t,
             pressure_t * edge.area - outer * energy_tt,
             pressure * (outer + radius) + pressure_radius * edge.area - energy_t,
             pressure,
         )
+
+    def pressure(self, edge: Edge, t: float) -> float:
+        """Return the gauge pressure."""
+        return 0.0 if self.unpressurised else float(self._pressure(edge, t)[0])
 
     def position(self, edge: Edge, t: Number) -> Number:
         """Return z of the rim above the apex."""

@@ -81,7 +81,8 @@ class EnergyTable:
         work = self.P_atm * (volume - self.anchor) - (self.P_atm + self.P_0) * self.anchor * np.log(
             volume / self.anchor
         )
-        return energy + work
+        total: Array = energy + work
+        return total
 
 
 def solve(
@@ -122,9 +123,10 @@ def _walk(table: EnergyTable, heights: Array) -> tuple[float, float, float, int]
     step = float(heights[1] - heights[0])
     below, here = table.row(heights[0] - step), table.row(heights[0])
     index = table.r.size - 1
-    lowest, zero, last, detachment = math.inf, math.nan, math.nan, float(heights[0])
-    for count, z in enumerate(heights):
+    lowest, zero, last, detachment, rows = math.inf, math.nan, math.nan, float(heights[0]), 2
+    for z in heights:
         above = table.row(z + step)
+        rows += 1
         index = _critical(here, index)
         if index < 0:
             break
@@ -133,7 +135,7 @@ def _walk(table: EnergyTable, heights: Array) -> tuple[float, float, float, int]
             zero = float(z) if math.isnan(last) or last <= 0 else float(z) - step * force / (force - last)
         lowest, last, detachment = min(lowest, force), force, float(z)
         below, here = here, above
-    return lowest, zero, detachment, (count + 3) * table.r.size
+    return lowest, zero, detachment, rows * table.r.size
 
 
 def _critical(row: Array, index: int) -> int:
