@@ -157,7 +157,8 @@ def open_pump(bench: Bench, clock: Clock = time.perf_counter, connections: dict[
 
 def open_daq(bench: Bench, pressure: bool, connections: dict[str, str] | None = None) -> Daq:
     """Open one task with the channels the scene needs; sampling has not begun."""
-    from drivers.daq import BridgeChannel, Channel, NIDaq, VoltageChannel, signal_channel
+    from drivers.daq import NIDaq
+    from drivers.daq_channels import BridgeChannel, Channel, VoltageChannel, signal_channel, signal_channel
 
     part = bench.force
     channels: list[Channel] = []
@@ -175,11 +176,8 @@ def open_daq(bench: Bench, pressure: bool, connections: dict[str, str] | None = 
     else:
         channels.append(VoltageChannel("force", part.channel, -part.range_V, part.range_V, part.terminal))
     if pressure and bench.pressure is not None:
-        for name, physical in (
-            ("pressure", bench.pressure.signal_channel),
-            ("supply", bench.pressure.supply_channel),
-        ):
-            channels.append(signal_channel(name, physical, bench.pressure.terminal))
+        signal, supply, terminal = bench.pressure.signal_channel, bench.pressure.supply_channel, bench.pressure.terminal
+        channels += [signal_channel("pressure", signal, terminal), signal_channel("supply", supply, terminal)]
     return NIDaq(
         channels,
         rate=bench.daq.rate_Hz,
