@@ -220,6 +220,15 @@ def test_every_fault_begins_and_ends_at_its_sample(fault: Fault, row: int, level
     np.testing.assert_array_equal(volts[:, 62:], sound[:, 62:])
 
 
+def test_a_fault_keeps_its_sample_when_the_plant_moves_before_the_first_read() -> None:
+    world = SignalWorld(Fault("supply", "sag", at_sample=25, for_samples=5, value=4.5))
+    electronics = Electronics(usb_6211(), [Input.of(SUPPLY)], RATE, faults=world.faults, start=world.sample)
+    acquisition = Acquisition(world, electronics, AtOnce(), RATE, 1000)
+    world.advance(10, RATE)
+    volts = acquisition.read(40, 1.0)[0]
+    np.testing.assert_array_equal(np.flatnonzero(volts < 4.8), np.arange(15, 20))
+
+
 def test_a_noise_fault_makes_noise() -> None:
     world = SignalWorld(Fault("force", "noise", value=20.0), Fault("pressure", "noise", value=20.0))
     quiet, loud = digitised(SignalWorld(), [1000]).std(axis=1), digitised(world, [1000]).std(axis=1)

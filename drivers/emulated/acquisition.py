@@ -66,6 +66,7 @@ class Acquisition:
         self._blocks: deque[Array] = deque()
         self._nothing = np.empty((electronics.channels, 0))
         self._lock = threading.Lock()
+        self._begun = False
         self._overwritten = False
         self.available = 0
         self.acquired = 0
@@ -82,6 +83,9 @@ class Acquisition:
 
     def produce(self, samples: int) -> None:
         """Move the plant on by ``samples`` and keep what the device makes of them."""
+        if not self._begun:
+            self._begun = True
+            self._electronics.begin(self._world.sample)
         while samples > 0:
             count = min(samples, _LARGEST_BLOCK)
             volts = self._electronics.digitise(self._world.advance(count, self.rate))

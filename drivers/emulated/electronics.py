@@ -304,6 +304,10 @@ class Electronics:
         stream = zlib.crc32(repr((seed, run, [wanted.physical for wanted in inputs])).encode())
         self._noise = NoiseStream(stream, (*noise[:, 0].tolist(), *[1.0] * len(inputs)))
 
+    def begin(self, sample: int) -> None:
+        """The first sample to come is this one of the plant; needed where the plant moves while a task is set up."""
+        self._start = self._next = sample
+
     @property
     def channels(self) -> int:
         """Number of rows ``digitise`` returns."""
