@@ -245,6 +245,7 @@ def _pdf_pages(report: Report, pages: PdfPages) -> None:
     lines += ["", *(f"{name} {number}" for name, number in versions().items())]
     for first in range(0, len(lines), 70):
         with canvas(11.7, 8.3) as figure:
+            figure.set_layout_engine("none")
             figure.text(
                 0.03, 0.97, "\n".join(lines[first : first + 70]), va="top", family="DejaVu Sans Mono", fontsize=6
             )
@@ -267,7 +268,7 @@ def _place(figure: Figure, data: bytes) -> None:
 
     from matplotlib.image import imread
 
-    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96))
+    axes = figure.subplots()
     axes.set_axis_off()
     axes.imshow(imread(io.BytesIO(data), format="png"), interpolation="none")
 

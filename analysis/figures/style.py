@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, YELLOW, BLACK, GREY = "#56B4E9", "#E69F00", "#000000", "#767676"
-CYCLE = (BLUE, ORANGE, GREEN, PURPLE, YELLOW, SKY, BLACK)
+CYCLE = (BLUE, YELLOW, GREEN, PURPLE, ORANGE, SKY, BLACK)
 """Okabe and Ito's colours, in the order used."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--tables", action="store_true", help="print Tables S1 to S5 as far as the recordings fill them"
     )
-    output.add_argument("--published", action="store_true", help="check the published tables; needs no recording")
+    parser.add_argument("--published", action="store_true", help="check the published tables; needs no recording")
     parser.add_argument("--report", type=Path, metavar="HTML", help="write one self-contained page")
     parser.add_argument("--pdf", type=Path, metavar="PDF", help="write the report as PDF")
     parser.add_argument("--curves", type=Path, metavar="DIR", help="write each curve, and each mean of repeats, as CSV")

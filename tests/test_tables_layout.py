@@ -1,0 +1,141 @@
+"""Tables S1 to S5 from groups of runs: layout, numbers, uncertainties."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from analysis import Run, Sensors, analyze
+from analysis.published import TABLE_S1, TABLE_S2, TABLE_S3, TABLE_S5_ROWS
+from analysis.repeats import Group, group
+from analysis.synthetic import Experiment, Imperfections, Profile, pull_off_run
+from analysis.tables import Table, all_tables, characterization, fiber_samples, fiber_summary, jkr_summary
+from model import Gas, Parameters, Substrate
+
+FAST = Experiment(rate=100.0, retract_speed=100e-6, dwell=2.0, settle=2.0, tail=3.0)
+
+
+def run_of(
+    force: float, *, parameters: Parameters | None, protocol: str = "pull_off", seed: int = 0, **settings: object
+) -> Run:
+    place = np.linspace(-0.05e-3, 1e-3, 1500)
+    gas = 0.0 if parameters is None else parameters.gas.initial_pressure
+    profile = Profile(place, -force * np.sin(np.pi * place / 1.2e-3), np.full(place.size, gas))
+    flaws = Imperfections(force_noise=1e-3 * force, pressure_noise=5.0)
+    test = replace(FAST, preload=force, approach_stiffness=1800 * force, settings=settings)
+    run, _ = pull_off_run(profile, test, flaws, seed=seed, parameters=parameters, sensors=Sensors(force_gain=1e-3))
+    run = replace(
+        run, protocol=protocol, name=f"{protocol}-{force:g}-{gas:g}-{seed}-{'-'.join(map(str, settings.values()))}"
+    )
+    return run if protocol == "pull_off" else replace(run, pressure=None)
+
+
+@cache
+def published_groups(gripper: str) -> list[Group]:
+    """Groups whose forces and pressures are those of Table S1 or S2."""
+    runs = []
+    for column, diameter in zip(
+        TABLE_S1 if gripper == "rigid" else TABLE_S2, (15e-3, 30e-3, 60e-3, None), strict=False
+    ):
+        shape = Substrate("flat") if diameter is None else Substrate("sphere", diameter)
+        ends = ((column.highest_pressure, column.least_force), (column.lowest_pressure, column.largest_force))
+        for pressure, force in ends:
+            parameters = Parameters(shape, gas=Gas(initial_pressure=float(pressure) * 1e3))
+            runs.append(run_of(float(force), parameters=parameters, gripper=gripper))
+    return group(analyze(run, uncertainties=False) for run in runs)
+
+
+def cell(table: Table, row: str, column: str) -> str:
+    found = next(cells for cells in table.rows if cells[0].startswith(row))
+    return found[table.header.index(column)]
+
+
+def number(text: str) -> float:
+    return float(text.partition("±")[0])
+
+
+def test_table_s1_has_the_papers_rows_and_values() -> None:
+    table = characterization(published_groups("rigid"))
+    assert table.header == ("Characterization Parameters", "d_b 15 mm", "d_b 30 mm", "d_b 60 mm", "Flat Glass")
+    for column in TABLE_S1:
+        assert number(cell(table, "Min. Pull-off", column.substrate)) == pytest.approx(
+            float(column.least_force), rel=0.01
+        )
+        assert number(cell(table, "Max. Pull-off", column.substrate)) == pytest.approx(
+            float(column.largest_force), rel=0.01
+        )
+        assert number(cell(table, "Highest", column.substrate)) == pytest.approx(
+            float(column.highest_pressure), abs=0.02
+        )
+        assert number(cell(table, "Lowest", column.substrate)) == pytest.approx(float(column.lowest_pressure), abs=0.02)
+    assert cell(table, "Contact Area", "d_b 15 mm") == "N/A"
+    assert cell(table, "Min. Adhesion Stress", "d_b 30 mm") == "N/A"
+    assert cell(table, "Contact Area", "Flat Glass") == "1.67"
+    assert number(cell(table, "Max. Adhesion Stress", "Flat Glass")) == pytest.approx(6.69, abs=0.08)
+    assert number(cell(table, "Max. Adhesion Efficiency", "Flat Glass")) == pytest.approx(6.6, abs=0.1)
+    assert number(cell(table, "Min. Adhesion Efficiency", "d_b 60 mm")) == pytest.approx(1.8, abs=0.1)
+
+
+def test_cells_carry_their_uncertainty() -> None:
+    parameters = Parameters(Substrate("flat"), gas=Gas(initial_pressure=1600.0))
+    table = characterization(group([analyze(run_of(0.52, parameters=parameters))]))
+    assert "±" in cell(table, "Max. Pull-off", "Flat Glass")
+    assert "±" in cell(table, "Max. Adhesion Efficiency", "Flat Glass")
+    assert cell(table, "Enhancing", "Flat Glass").startswith("1.000")
+
+
+def test_table_s2_is_the_soft_gripper() -> None:
+    table = characterization(published_groups("soft"), "soft")
+    assert "S2" in table.title
+    assert number(cell(table, "Enhancing", "d_b 60 mm")) == pytest.approx(5.94, abs=0.1)
+    assert all_tables(published_groups("soft"))[0].title == table.title
+
+
+def test_tables_s3_and_s4_keep_the_populations_apart() -> None:
+    runs = []
+    for seed, (place, force, area) in enumerate(TABLE_S3.rows):
+        settings: dict[str, object] = {"position": place, "indenter_radius_mm": 4.0}
+        if area is not None:
+            settings["contact_area_mm2"] = float(area)
+        runs.append(run_of(float(force) * 1e-3, parameters=None, protocol="indentation", seed=seed, **settings))
+    table = jkr_summary(group(analyze(run, uncertainties=False) for run in runs))
+    force = "Pull-off force, F_off [mN]"
+    assert number(cell(table, "AVG.", force)) == pytest.approx(78.04, rel=0.01)
+    assert number(cell(table, "Work of Adhesion", force)) == pytest.approx(4.14, rel=0.01)
+    assert number(cell(table, "Adhesion Stress, σ_ad", force)) == pytest.approx(100.9, rel=0.01)
+    assert number(cell(table, "Adhesion Stress, positions", force)) == pytest.approx(104.2, rel=0.01)
+    assert cell(table, "Top", "Projected Contact Area, A_pc [mm²]") == ""
+
+
+def test_table_s5_from_fibre_samples() -> None:
+    runs = [
+        run_of(
+            float(force) * 1e-3,
+            parameters=None,
+            protocol="fiber",
+            sample=name,
+            real_area_um2=float(real),
+            projected_area_um2=float(projected),
+        )
+        for name, force, real, projected in TABLE_S5_ROWS
+    ]
+    groups = group(analyze(run, uncertainties=False) for run in runs)
+    table = fiber_summary(fiber_samples(groups))
+    force = "Adhesion, F_off [mN]"
+    assert number(cell(table, "AVG.", force)) == pytest.approx(1.867, rel=0.01)
+    assert number(cell(table, "Single Fiber Adhesion, F", force)) == pytest.approx(0.622, rel=0.01)
+    assert cell(table, "AVG.", "Real Contact Area, A_rc [µm²]") == "12930.1"
+    assert number(cell(table, "Single Fiber Adhesion Stress", force)) == pytest.approx(144.4, rel=0.01)
+    assert number(cell(table, "3 Fibers", force)) == pytest.approx(89.9, rel=0.01)
+    assert [t.title for t in all_tables(groups)] == [table.title]
+
+
+def test_tables_render_and_escape() -> None:
+    table = Table("T | <x>", ("a", "b"), (("1|2", "<b>"),), ("note & more",))
+    assert "1\\|2" in table.markdown()
+    assert "&lt;b&gt;" in table.html()
+    assert "note &amp; more" in table.html()
+    assert list(table.frame().columns) == ["a", "b"]
