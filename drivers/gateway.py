@@ -16,6 +16,8 @@ from urllib.parse import urlsplit
 CODE_PAGE = "cp1252"
 CONNECT_TIMEOUT = 2.0
 URGENT_PATIENCE = 0.02
+DRAIN_READS = 1000
+"""A device that babbles without end must not be listened to without end."""
 
 
 class Port(Protocol):
@@ -61,12 +63,13 @@ class _TcpPort:
     def drain(self) -> None:
         self._socket.setblocking(False)
         try:
-            while self._socket.recv(4096):
-                pass
+            for _ in range(DRAIN_READS):
+                if not self._socket.recv(4096):
+                    raise ConnectionResetError("the far end has closed the connection")
         except BlockingIOError:
+            pass
+        finally:
             self._socket.settimeout(CONNECT_TIMEOUT)
-            return
-        raise ConnectionResetError("the far end has closed the connection")
 
     def close(self) -> None:
         self._socket.close()
@@ -94,8 +97,10 @@ class _SerialPort:
 
     def drain(self) -> None:
         # Not reset_input_buffer: on a lost terminal that raises termios.error, which is no OSError.
-        while self._port.in_waiting:
-            self._port.read(self._port.in_waiting)
+        for _ in range(DRAIN_READS):
+            if not (waiting := self._port.in_waiting):
+                return
+            self._port.read(waiting)
 
     def close(self) -> None:
         self._port.close()

@@ -6,6 +6,7 @@ Sources: KD Scientific Legato 200 series manual (command set, prompts, status fl
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import re
 import threading
@@ -320,10 +321,13 @@ class LegatoPump:
 
     def _keep_memory(self) -> None:
         """Switch writing to the pump's memory off, which wears out; firmwares call it differently."""
-        try:
-            self._ask("nvram off")
-        except CommandRefused:
-            self._ask("nvram none")
+        for word in ("off", "none"):
+            with contextlib.suppress(CommandRefused):
+                self._ask(f"nvram {word}")
+                return
+        logging.getLogger(__name__).warning(
+            "pump: takes neither 'nvram off' nor 'nvram none'; every setting wears its memory"
+        )
 
     def _read_limits(self) -> tuple[float, float]:
         """Read the limits both ways; a per mille inside them, since the pump may refuse its own rounded limits."""
@@ -475,8 +479,10 @@ class LegatoPump:
             self._awaited.clear()
         try:
             # Not reset_input_buffer: on a lost terminal that raises termios.error, which is no OSError.
-            while self._port.in_waiting:
-                self._port.read(self._port.in_waiting)
+            for _ in range(LONGEST_REPLY):
+                if not (waiting := self._port.in_waiting):
+                    break
+                self._port.read(waiting)
         except OSError as error:
             raise self._lost("ver", error) from error
         landmark = self._send("", "poll on", "ver")

@@ -252,12 +252,13 @@ class PIStage:
             with self._exchange("confirm the halt", check=False):
                 self._stop_pressed.clear()
                 self._read_errors_away()
-                self._halting = False
         except DeviceError:
             if pressed:
                 self._stop_pressed.set()
             self._send_urgent(STOP_EVERYTHING)
             raise
+        finally:
+            self._halting = False
 
     def emergency_stop(self) -> None:
         """Write the stop byte past every lock and queue, from any thread.

@@ -46,3 +46,23 @@ def receive(connection: socket.socket, size: int) -> bytes:
         while len(data) < size and (more := connection.recv(size - len(data))):
             data += more
     return data
+
+
+@contextlib.contextmanager
+def flood(data: bytes) -> Iterator[str]:
+    """Serve a device that sends the same bytes for ever and listens to nothing; yield its address."""
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def babble() -> None:
+        connection, _ = listener.accept()
+        with connection, contextlib.suppress(OSError):
+            while True:
+                connection.sendall(data)
+
+    thread = threading.Thread(target=babble)
+    thread.start()
+    try:
+        yield f"socket://127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        thread.join()
+        listener.close()

@@ -6,6 +6,7 @@ import threading
 import time
 
 import pytest
+from dialogue import flood
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_world import MotionWorld
@@ -423,6 +424,12 @@ def babble(replies):
         return connect("fake")
 
 
+@pytest.mark.parametrize("data", [b"\x00\xff" * 500, b"\n:\x11" * 100, b"x" * 999, b"\n1.2.3\r\n:\x11" * 50])
+def test_a_device_that_babbles_without_end(data):
+    with flood(data) as url, pytest.raises(DeviceError):
+        connect(url, reply_timeout=0.05)
+
+
 @settings(deadline=None)
 @given(REPLIES)
 def test_connecting_to_nonsense_is_a_device_error(replies):
@@ -430,7 +437,7 @@ def test_connecting_to_nonsense_is_a_device_error(replies):
         babble(replies)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(REPLIES, CALLS)
 def test_nonsense_in_operation_is_a_device_error_or_a_finite_volume(replies, calls):
     pump = babble(GOOD_START + replies)

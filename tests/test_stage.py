@@ -6,6 +6,7 @@ import threading
 import time
 
 import pytest
+from dialogue import flood
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_world import MotionWorld
@@ -460,6 +461,12 @@ def connect(replies):
         return PIStage("fake")
 
 
+@pytest.mark.parametrize("data", [b"\x00\xff" * 500, b"0x9000\n" * 100, b"x" * 999, b"1=5 \n" * 99])
+def test_a_device_that_babbles_without_end(data):
+    with flood(data) as url, pytest.raises(DeviceError):
+        PIStage(url, reply_timeout=0.05)
+
+
 @settings(deadline=None)
 @given(REPLIES)
 def test_connecting_to_nonsense_is_a_device_error(replies):
@@ -467,7 +474,7 @@ def test_connecting_to_nonsense_is_a_device_error(replies):
         connect(replies)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(REPLIES, CALLS)
 def test_nonsense_in_operation_is_a_device_error_or_a_finite_position(replies, calls):
     stage = connect(GOOD_START + replies)
