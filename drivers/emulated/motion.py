@@ -186,6 +186,8 @@ class Carriage:
         """True position at a time from the last command on, m."""
         if self._blocked is not None:
             return self._blocked
+        if time >= self._still_from:
+            return self._trajectory[-1].position
         index = self._index(time)
         segment = self._trajectory[index]
         commanded, velocity = segment.at(time)
@@ -218,6 +220,7 @@ class Carriage:
         """The decaying part of the lagging position at the start of each segment, from its present value."""
         offsets = []
         lag = self._lag
+        self._still_from = self._trajectory[-1].start + FORGOTTEN * lag
         following = self._trajectory[1:]
         for index, segment in enumerate(self._trajectory):
             offset = position - segment.position + lag * (segment.velocity - lag * segment.acceleration)
