@@ -295,6 +295,54 @@ def test_every_fault_kind_is_documented_by_device() -> None:
 # Real time
 
 
+def test_every_n_samples_the_client_is_called(world: SignalWorld) -> None:
+    with (
+        EmulatedDaq(world, speed=20.0) as server,
+        grpc.insecure_channel(server.address) as channel,
+        nidaqmx.Task(grpc_options=GrpcSessionOptions(channel, "")) as task,
+    ):
+        timed(task)
+        reader = AnalogMultiChannelReader(task.in_stream)
+        blocks: list[np.ndarray[Any, Any]] = []
+
+        def arrived(_task: object, _kind: object, samples: int, _data: object) -> int:
+            block = np.empty((3, samples))
+            reader.read_many_sample(block, samples, 10.0)
+            blocks.append(block)
+            return 0
+
+        world.force = lambda index: index * 1e-3
+        task.register_every_n_samples_acquired_into_buffer_event(50, arrived)
+        task.start()
+        eventually(lambda: len(blocks) >= 6)
+        task.stop()
+        joined = np.concatenate(blocks, axis=1)[0]
+        assert np.abs(np.diff(joined) / 0.8e-3 - 1).max() < 8
+        task.register_every_n_samples_acquired_into_buffer_event(50, None)
+
+
+def test_events_are_registered_once_and_before_the_start(task: nidaqmx.Task) -> None:
+    timed(task)
+    interpreter, handle = task._interpreter, task._handle
+
+    def register(samples: int) -> Any:
+        return interpreter.register_every_n_samples_event(handle, 1, samples, 0, lambda *_: 0, None)
+
+    with pytest.raises(DaqError) as failure:
+        register(0)
+    assert code_of(failure) == -200077
+    first = register(10)
+    with pytest.raises(DaqError) as failure:
+        register(10)
+    assert code_of(failure) == -200966
+    interpreter.unregister_every_n_samples_event(handle, 1)
+    first.close()
+    task.start()
+    with pytest.raises(DaqError) as failure:
+        register(10)
+    assert code_of(failure) == -200960
+
+
 def eventually(condition: Any, seconds: float = 20.0) -> None:
     """Wait until it is so; fails only if it never is."""
     end = time.monotonic() + seconds
@@ -321,11 +369,12 @@ def test_in_real_time_the_stream_is_contiguous_and_not_ahead_of_the_plant(world:
         assert world.sample >= 2000
 
 
-def test_in_real_time_reading_takes_real_time(world: SignalWorld) -> None:
-    with EmulatedDaq(world, speed=2.0) as server, connect(server) as daq:
+def test_in_real_time_no_sample_comes_before_its_time(world: SignalWorld) -> None:
+    with EmulatedDaq(world, speed=2.0) as server:
         begin = time.perf_counter()
-        daq.read(200)
-        assert time.perf_counter() - begin >= 0.1
+        with connect(server) as daq:
+            daq.read(200)
+            assert time.perf_counter() - begin >= 0.1
 
 
 def test_in_real_time_a_reader_that_sleeps_overruns(world: SignalWorld) -> None:

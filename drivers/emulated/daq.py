@@ -8,7 +8,7 @@ the ``*_raw`` fields. What it delivers comes from the plant by way of ``electron
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent import futures
 from typing import Any
 
@@ -110,34 +110,40 @@ class EmulatedDaq:
 def _handlers(service: DaqService, calls: Counter[str]) -> grpc.GenericRpcHandler[Any, Any]:
     """Bind every method of the service that has an RPC's name; gRPC answers UNIMPLEMENTED to the others."""
     handlers = {
-        method.name: grpc.unary_unary_rpc_method_handler(
-            _answer(method.name, getattr(service, method.name), _message(method.output_type), calls),
-            request_deserializer=_message(method.input_type).FromString,
-        )
+        method.name: _handler(method, getattr(service, method.name), calls)
         for method in _SERVICE.methods
         if hasattr(service, method.name)
     }
     return grpc.method_handlers_generic_handler(_SERVICE.full_name, handlers)
 
 
-def _message(descriptor: Any) -> Any:
-    return getattr(nidaqmx_pb2, descriptor.name)
+def _handler(method: Any, action: Callable[[Any, Any], Any], calls: Counter[str]) -> Any:
+    request = getattr(nidaqmx_pb2, method.input_type.name)
+    response = getattr(nidaqmx_pb2, method.output_type.name)
 
-
-def _answer(
-    name: str, method: Callable[[Any, Any], Any], response: Any, calls: Counter[str]
-) -> Callable[[Any, Any], bytes]:
-    def answer(request: Any, context: Any) -> bytes:
-        calls[name] += 1
+    def perform(message: Any, context: Any) -> Any:
+        calls[method.name] += 1
         try:
-            result = method(request, context)
+            return action(message, context)
         except Refusal as refusal:
             context.set_trailing_metadata(_trailer(refusal))
             context.abort(grpc.StatusCode.UNKNOWN, str(refusal))
             raise
-        return result if isinstance(result, bytes) else response(**result).SerializeToString()
 
-    return answer
+    def answer(message: Any, context: Any) -> bytes:
+        result = perform(message, context)
+        return result if isinstance(result, bytes) else serialised(result)
+
+    def stream(message: Any, context: Any) -> Iterator[bytes]:
+        return map(serialised, perform(message, context))
+
+    def serialised(result: dict[str, Any]) -> bytes:
+        text: bytes = response(**result).SerializeToString()
+        return text
+
+    if method.server_streaming:
+        return grpc.unary_stream_rpc_method_handler(stream, request_deserializer=request.FromString)
+    return grpc.unary_unary_rpc_method_handler(answer, request_deserializer=request.FromString)
 
 
 def _trailer(refusal: Refusal) -> tuple[tuple[str, str], ...]:

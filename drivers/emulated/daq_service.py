@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,6 +33,7 @@ _MILLIVOLTS_PER_VOLT = {15897: 1.0, 15896: 1e3}  # DAQmx_Val_mVoltsPerVolt, DAQm
 _NEWTONS = {15875: 1.0, 15876: 4.4482216152605, 15877: 9.80665}  # newtons, pounds, kilogram-force
 _LEASE = 2.0  # s without a read, after which another client may take the device over
 _LONGEST_READ = 60.0  # s
+_EVENT_TICK = 1e-3  # s
 
 
 @dataclass
@@ -44,6 +46,7 @@ class Task:
     mode: int = CONTINUOUS
     samples: int = 1000
     buffer: int | None = None
+    every: int = 0
     running: Acquisition | None = None
     last_read: float = 0.0
 
@@ -91,6 +94,7 @@ class DaqService:
         with self._lock:
             task = self._task(request)
             self._halt(task)
+            task.every = 0
             del self._tasks[task.name]
             return {}
 
@@ -186,6 +190,39 @@ class DaqService:
         if not volts.size:
             raise Refusal(TIMED_OUT, "Some or all of the samples requested have not yet been acquired.", 0)
         return {"value": float(volts[0, 0])}
+
+    # Events
+
+    def RegisterEveryNSamplesEvent(self, request: Any, context: Any) -> Iterator[dict[str, Any]]:
+        with self._lock:
+            task = self._task(request)
+            if task.running:
+                raise Refusal(-200960, "Register all your events prior to starting the task.")
+            if task.every:
+                raise Refusal(-200966, "DAQmx software event has already been registered.")
+            if not request.n_samples:
+                raise Refusal(-200077, "An event every 0 samples is not supported.")
+            task.every = request.n_samples
+        context.send_initial_metadata(())  # the client waits for it before it goes on
+        answer = {
+            "every_n_samples_event_type_raw": request.every_n_samples_event_type_raw,
+            "n_samples": request.n_samples,
+        }
+        return (answer for _ in self._every(task, context))
+
+    def UnregisterEveryNSamplesEvent(self, request: Any, context: Any) -> dict[str, Any]:
+        self._task(request).every = 0
+        return {}
+
+    def _every(self, task: Task, context: Any) -> Iterator[int]:
+        """Yield whenever another ``task.every`` samples are in the buffer, while anybody listens."""
+        heard, due = None, 0
+        while context.is_active() and task.every and not self.stopping.wait(_EVENT_TICK):
+            if task.running is not heard:
+                heard, due = task.running, task.every
+            while heard is not None and heard is task.running and heard.acquired >= due:
+                yield due
+                due += task.every
 
     # Attributes
 
