@@ -74,7 +74,7 @@ class Batch:
         units = {name: "N" if name.endswith("force") else "m" for name in FEATURES}
         columns = {f"{name}_{unit}": getattr(self, name) for name, unit in units.items()}
         columns |= {f"{name}_error_{units[name]}": self.numerical_error[name] for name in ERRORS}
-        return pd.DataFrame({"outcome": [outcome.value for outcome in self.outcome], **columns})
+        return pd.DataFrame({"outcome": [str(outcome) for outcome in self.outcome], **columns})
 
 
 def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, nodes: int = NODES) -> Batch:
@@ -277,7 +277,7 @@ class _Refinement:
         t: Array = bounds(self.cone, Edge(*(part + zero for part in edge)))[1]
         for _ in range(60):
             state = self.cone.state(edge, t)
-            step = state.force / state.force_t
+            step = np.where(inflated, state.force / np.where(inflated, state.force_t, 1.0), 0.0)
             t = np.maximum(t - step, 0.0)
             if (np.abs(step) <= 1e-12 * t)[inflated].all():
                 break
@@ -356,17 +356,41 @@ class _Refinement:
         on_left = (self.force_climb[self.rows, left] > 0) & (here < 0) & (left < k)
         on_right = (here > 0) & (self.force_climb[self.rows, right] < 0) & (right > k)
         inner = on_left | on_right
-        hidden = ((here > 0) & (right > k) & ~on_right) | ((here < 0) & (left < k) & ~on_left)
-        self.fine &= ~hidden | inner
+        self.fine &= ~self._hides_minimum(last)
         radius, t = self._root(2, np.where(on_left, left, k), np.where(on_left, k, right), inner)
         edge = self.cone.edge(radius[:, None])
         refined = self.cone.state(edge, t[:, None]).force[:, 0]
+        self.fine &= ~inner | self._resolved(np.where(on_left, left, k), np.where(on_left, k, right), radius, refined)
         inner &= refined <= force[self.rows, k]
         return (
             np.where(inner, refined, force[self.rows, k]),
             np.where(inner, self.cone.position(edge, t[:, None])[:, 0], self.position[self.rows, k]),
             (np.where(inner, radius, self.radius[self.rows, k]), np.where(inner, t, self.t[self.rows, k])),
         )
+
+    def _resolved(self, before: Array, after: Array, radius: Array, force: Array) -> NDArray[np.bool_]:
+        """Whether Hermite's cubic between two nodes foretells the minimum found between them: no second one hides."""
+        rows = self.rows
+        width = self.radius[rows, after] - self.radius[rows, before]
+        x = (radius - self.radius[rows, before]) / width
+        force_a, force_b = self.force[rows, before], self.force[rows, after]
+        rise = force_b - force_a
+        a = self.force_climb[rows, before] * width - rise
+        b = rise - self.force_climb[rows, after] * width
+        foretold = force_a + x * rise + x * (1 - x) * (a * (1 - x) + b * x)
+        depth = np.maximum(force_a, force_b) - force
+        resolved: NDArray[np.bool_] = np.abs(foretold - force) <= 0.5 * depth
+        return resolved
+
+    def _hides_minimum(self, last: Array) -> NDArray[np.bool_]:
+        """Whether the force has several minima, or rises between two nodes at both of which it falls or the reverse."""
+        falls = self.force_climb > 0
+        rising = np.diff(self.force, axis=1) > 0
+        inside = np.arange(1, self.force.shape[1]) <= last[:, None]
+        inconsistent = (inside & (falls[:, 1:] == falls[:, :-1]) & (rising == falls[:, 1:])).any(axis=1)
+        minima = (inside & falls[:, :-1] & ~falls[:, 1:]).sum(axis=1)
+        hides: NDArray[np.bool_] = inconsistent | (minima > 1)
+        return hides
 
     def _zero(self, top: Array) -> tuple[Array, Array]:
         """Return z where the force first turns tensile (at the start, pinned or on the branch) and its error."""

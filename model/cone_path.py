@@ -150,10 +150,8 @@ def strongest_pull(branch: Branch, path: Path) -> Point:
 def _strongest_of(branch: Branch, stretch: Stretch) -> Point:
     """Return the lowest force of a stretch: a node, or the minimum between two whose slopes dF/dr differ in sign."""
     points = stretch.points(branch)
-    lowest = min(range(len(points)), key=lambda k: points[k].force)
-    around = range(max(lowest - 1, 0), min(lowest + 1, len(points) - 1) + 1)
-    best = points[lowest]
-    for before, after in itertools.pairwise(points[k] for k in around):
+    best = min(points, key=lambda point: point.force)
+    for before, after in itertools.pairwise(points):
         if before.force_climb > 0 and (after.force_climb <= 0 or after.force >= before.force):
             beyond = _past_minimum(branch, before, after)
             if beyond.force_climb < 0:

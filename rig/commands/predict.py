@@ -162,7 +162,8 @@ def as_text(prediction: Prediction, title: str, *, profile: bool) -> str:
     if math.isfinite(prediction.pull_off_force):
         error = prediction.numerical_error
         lines += [
-            f"  F_p  {prediction.pull_off_force:.6f} N   (+- {error.get('pull_off_force', math.nan):.1e} N numerically)",
+            f"  F_p  {prediction.pull_off_force:.6f} N   "
+            f"(+- {error.get('pull_off_force', math.nan):.1e} N numerically)",
             f"  D_p  {prediction.pull_off_distance * 1e3:.6f} mm  "
             f"(+- {error.get('pull_off_distance', math.nan) * 1e3:.1e} mm numerically)",
             f"  z_r at F_p     {prediction.retraction_at_pull_off * 1e3:.6f} mm",

@@ -1,0 +1,127 @@
+"""Tables of predictions: serial, on several processes, or on a Dask cluster, with the same bits whichever is used.
+
+The scenes are cut into blocks of a fixed size and every block is solved by one call, so the arithmetic does not
+depend on who does it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from model import MODELS, InvalidParameter, ModelError, Parameters
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+VECTORISED = {"cone": True, "cone-2017": False}
+"""Models with a batch solver, and whether their contact stores energy."""
+
+BLOCK = {True: 4096, False: 1}
+"""Scenes per block of a vectorised model, and of one that solves scene by scene."""
+
+Row = dict[str, Any]
+
+
+def sweep(
+    scenes: Sequence[Parameters],
+    model: str = "cone",
+    *,
+    processes: int = 1,
+    scheduler: str | None = None,
+    progress: Callable[[Iterable[list[Row]], int], Iterable[list[Row]]] | None = None,
+) -> pd.DataFrame:
+    """Predict many scenes.
+
+    Parameters
+    ----------
+    scenes
+        Complete scenes, SI units.
+    model
+        One of ``model.MODELS``.
+    processes
+        Number of worker processes; 1 computes here.
+    scheduler
+        Address of a Dask scheduler (``tcp://host:8786``) to use instead.
+    progress
+        Wraps the iterator over finished blocks; receives it and the number of blocks.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per scene in the order given: outcome, features with units in the column names, their numerical
+        errors. A scene that cannot be solved has its reason as outcome and no values; it does not end the sweep.
+
+    Raises
+    ------
+    InvalidParameter
+        The model is unknown.
+    """
+    import pandas as pd
+
+    if model not in MODELS:
+        raise InvalidParameter(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
+    size = BLOCK[model in VECTORISED]
+    blocks = [list(scenes[first : first + size]) for first in range(0, len(scenes), size)]
+    finished: Iterable[list[Row]] = _map(model, blocks, processes, scheduler)
+    if progress is not None:
+        finished = progress(finished, len(blocks))
+    return pd.DataFrame([row for block in finished for row in block])
+
+
+def _map(model: str, blocks: list[list[Parameters]], processes: int, scheduler: str | None) -> Iterator[list[Row]]:
+    if scheduler is not None:
+        yield from _on_cluster(model, blocks, scheduler)
+    elif processes > 1 and len(blocks) > 1:
+        yield from _on_processes(model, blocks, processes)
+    else:
+        for block in blocks:
+            yield solve_block(model, block)
+
+
+def _on_processes(model: str, blocks: list[list[Parameters]], processes: int) -> Iterator[list[Row]]:
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    # Spawned, as on Windows: a forked child would inherit the locks of the parent's threads.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(blocks)), mp_context=context) as pool:
+        yield from pool.map(solve_block, [model] * len(blocks), blocks)
+
+
+def _on_cluster(model: str, blocks: list[list[Parameters]], scheduler: str) -> Iterator[list[Row]]:
+    from distributed import Client
+
+    with Client(scheduler, timeout="30s") as client:
+        for future in client.map(solve_block, [model] * len(blocks), blocks, pure=False):
+            yield future.result()
+
+
+def solve_block(model: str, scenes: list[Parameters]) -> list[Row]:
+    """Return one row per scene of a block."""
+    if model not in VECTORISED:
+        return [_solve_alone(model, scene) for scene in scenes]
+    from model.batch import solve_many
+
+    try:
+        frame = solve_many(scenes, contact_stretch=VECTORISED[model]).frame()
+    except ModelError:
+        return [_solve_alone(model, scene) for scene in scenes]
+    return [{str(name): value for name, value in row.items()} for row in frame.to_dict("records")]
+
+
+def _solve_alone(model: str, scene: Parameters) -> Row:
+    from model import predict
+    from model.batch import ERRORS, FEATURES
+
+    units = {name: "N" if name.endswith("force") else "m" for name in FEATURES}
+    try:
+        prediction = predict(scene, model, points=64)
+    except ModelError as error:
+        row: Row = {"outcome": f"{type(error).__name__}: {error}"}
+        row |= {f"{name}_{unit}": math.nan for name, unit in units.items()}
+        return row | {f"{name}_error_{units[name]}": math.nan for name in ERRORS}
+    row = {"outcome": prediction.outcome.value}
+    row |= {f"{name}_{unit}": getattr(prediction, name) for name, unit in units.items()}
+    return row | {f"{name}_error_{units[name]}": prediction.numerical_error.get(name, math.nan) for name in ERRORS}
