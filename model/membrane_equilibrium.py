@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 STEP_TOLERANCE = 1e-8
 """Newton's last step; convergence is quadratic, so that the state after it is exact to rounding."""
+ROUNDING = 1e-5
+"""Steps below this that no longer shrink are rounding, which small strains and high orders amplify."""
 
 
 class Grid(NamedTuple):
@@ -317,6 +319,7 @@ def solve(
     targets = np.broadcast_to(np.asarray(target, dtype=float), width.shape)
     state = guess.copy()
     converged = np.zeros(width.size, dtype=bool)
+    before = np.full(width.size, np.inf)
     active = np.arange(width.size)
     evaluations = 0
     for _ in range(iterations):
@@ -330,7 +333,8 @@ def solve(
         size = relative_size(part, step, width[active])
         fraction = np.minimum(1.0, 0.5 / np.maximum(size, 1e-300))
         state[active] = part + fraction[:, None] * step
-        done = size < STEP_TOLERANCE
+        done = (size < STEP_TOLERANCE) | ((size < ROUNDING) & (size > 0.1 * before[active]))
+        before[active] = size
         converged[active[done]] = True
         active = active[~done & np.isfinite(size)]
         if active.size == 0:
@@ -373,7 +377,8 @@ def relative_size(state: Array, step: Array, width: Array) -> Array:
     u, rest = slice(0, order + 1), slice(order + 1, None)
     tension = np.maximum(np.abs(state[:, order + 1 : -2]).max(axis=1), np.abs(state[:, -1])) + 1e-300
     strain = tension / (4 + tension)  # w_1 = 4 strain for small strains
-    displacement = np.abs(step[:, u]).max(axis=1) / (np.minimum(width, 1) * np.exp(-width) * strain)
+    R = np.exp(-width[:, None] * (1 - node_positions(order)))
+    displacement = (np.abs(step[:, u]) / R).max(axis=1) / (np.minimum(width, 1) * strain)
     load = np.maximum(tension, np.abs(state[:, -2]))
     largest: Array = np.maximum(displacement, np.abs(step[:, rest]).max(axis=1) / load)
     return largest

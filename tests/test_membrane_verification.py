@@ -236,7 +236,7 @@ def natural_radius(surface, a):
 
 
 def test_sliding_disc_at_small_strain_is_the_frictionless_plate_on_a_sphere():
-    """Small strain, any Poisson's ratio: hoop strain -a^2 / (8 r_b^2) at the free edge, E h a^4 / (384 r_b^4) per area."""
+    """Any Poisson's ratio: hoop strain -a^2 / (8 r_b^2) at the free edge, energy E h a^4 / (384 r_b^4) per area."""
     a = 0.5
     strains, energies = [], []
     for curvature in (0.2, 0.1):
@@ -321,3 +321,89 @@ def test_loading_rate_is_the_stretch_of_the_ring_touched_next():
     lam = line.radius_rate / surface.cosine(line.radius)
     tension = float(np.hypot(Q, solved.state[0, -1]) / a[0])
     assert float((lam - lam**-3 * (line.radius / a) ** -2)[0]) == pytest.approx(tension, rel=1e-4)
+
+
+def inflated(gas, guess, width=6.0):
+    """Free inflation: a facet of e^-6 R_0 that slides and is left at no angle stands for the pole."""
+    problem = Annulus(FLAT, gas, 1.0, Sliding())
+    places = np.array([width])
+    solved = solve(problem, places, guess, closure=Closure.TANGENT, iterations=60)
+    assert solved.converged[0]
+    height = -float(shape(problem, places, solved.state).height[0])  # the dome hangs below its rim
+    return solved.state, 1 + float(solved.state[0, 0]) * math.exp(width), height
+
+
+def held(pressure):
+    return Gas(pressure, 5.8, math.inf, 14.0)
+
+
+def dome(order=24, width=6.0):
+    """A guess: the dome of a pole stretch 1.1, its radii and tensions as on a sphere."""
+    R = np.exp(-width * (1 - (1 - np.cos(np.pi * np.arange(order + 1) / order)) / 2))
+    state = np.zeros((1, 2 * order + 4))
+    state[0, : order + 1] = 0.1 * R * (1 - R**2)
+    state[0, order + 1 : -2] = 0.45 * R * np.sqrt(1 - 0.35 * R**2)
+    state[0, -2] = 0.5
+    return state
+
+
+@pytest.fixture(scope="module")
+def first_dome():
+    return inflated(held(0.527782), dome())
+
+
+def test_free_inflation_equals_two_independent_codes(first_dome):
+    """Pole stretch, p R_0 / mu h_0, w_0 / R_0: 1.1 .527782 .38347; 1.2 .999252 .53098; 1.5 1.643582 .79879."""
+    state, stretch, height = first_dome
+    assert (stretch, -height) == pytest.approx((1.1, 0.38347), abs=6e-5)
+    for pressure, expected, dome_height in ((0.999252, 1.2, 0.53098), (1.643582, 1.5, 0.79879)):
+        for step in np.linspace(float(state[0, -2]), pressure, 6)[1:]:
+            state, stretch, height = inflated(held(step), state)
+        assert (stretch, -height) == pytest.approx((expected, dome_height), abs=1.5e-4)
+
+
+def test_inflation_limit_point(first_dome):
+    """The chamber's volume leads through the limit point p = 1.87917347 at lambda_0 = 2.195945."""
+    state = first_dome[0]
+    volume = 0.3
+    pressures, stretches = [], []
+    for pressure in np.linspace(13.2, 110.0, 60):
+        state, stretch, _ = inflated(Gas(pressure, 5.8, volume, volume), state)
+        pressures.append(float(state[0, -2]))
+        stretches.append(stretch)
+    top = int(np.argmax(pressures))
+    assert 5 < top < 54
+    near = slice(top - 4, top + 5)
+    curve = np.polynomial.Polynomial.fit(stretches[near], pressures[near], 8)
+    limit = next(
+        float(x.real) for x in curve.deriv().roots() if abs(x.imag) < 1e-9 and abs(x.real - stretches[top]) < 0.1
+    )
+    assert limit == pytest.approx(2.195945, abs=4e-4)
+    assert curve(limit) == pytest.approx(1.87917347, abs=5e-5)
+
+
+def test_small_inflation_has_the_corrected_hencky_constant(first_dome):
+    """w_0 = C R_0 (p R_0 / E h)^(1/3), C = 0.59488 at nu = 1/2; approached at first order in the strain."""
+    state = first_dome[0]
+    constants = []
+    for pressure in np.geomspace(0.5, 5e-4, 16):
+        guess = state.copy()
+        ratio = pressure / float(state[0, -2])
+        guess[0, :-2] *= ratio ** (2 / 3)
+        guess[0, -2:] *= ratio
+        state, _, height = inflated(held(pressure), guess)
+        constants.append((pressure ** (2 / 3), -height / (pressure / 3) ** (1 / 3)))
+    (first, coarse), (second, fine) = constants[-2:]
+    assert fine == pytest.approx(0.59488, abs=1e-3)
+    assert fine - (coarse - fine) * second / (first - second) == pytest.approx(0.59488, abs=6e-5)
+
+
+def test_point_load_limit():
+    """z = k R_0 (F / E h R_0)^(1/3): k = .8937, .9283, .9357 at a = 1e-2, 1e-3, 1e-4 R_0, nu = 1/2."""
+    problem = annulus(1e-9)
+    factors = []
+    for a in (1e-2, 1e-3, 1e-4):
+        width, state = state_at(problem, a, 40)
+        height = float(shape(problem, width, state).height[0])
+        factors.append(height / (2 * math.pi * float(state[0, -1]) / 3) ** (1 / 3))
+    assert factors == pytest.approx([0.8937, 0.9283, 0.9357], abs=2e-4)
