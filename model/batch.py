@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import cone
-from model.cone_branch import bounds, largest_slope, tilts
+from model.cone_branch import COARSE, bounds, largest_slope, tilts
 from model.cone_error import SAFETY, rounding
 from model.cone_terms import Cone, Edge, Isothermal, Vented
 from model.errors import NotConverged
@@ -231,7 +231,9 @@ class _Refinement:
         half = np.sin(np.linspace(np.pi / 2, 0.0, nodes + 1)[:-1]) ** 2
         self.radius = self.cone.start_radius * half
         edge = self.cone.edge(self.radius)
-        self.t = largest_slope(self.cone, edge)
+        self.t = largest_slope(self.cone, edge, COARSE)
+        value, slope = self.cone.residual(edge, self.t)
+        self.t = self.t - np.where(value == 0, 0.0, value / slope)
         self.start_edge = Edge(*(part[:, :1] if isinstance(part, np.ndarray) else part for part in edge))
         self.position = self.cone.position(edge, self.t)
         self.force, self.climb, self.force_climb = self._slopes(edge, self.t)
@@ -370,17 +372,20 @@ class _Refinement:
 
     def _resolved(self, before: Array, after: Array, radius: Array, force: Array) -> NDArray[np.bool_]:
         """Whether Hermite's cubic between two nodes foretells the minimum found between them: no second one hides."""
+        depth = np.maximum(self.force[self.rows, before], self.force[self.rows, after]) - force
+        resolved: NDArray[np.bool_] = np.abs(self._foretold(before, after, radius) - force) <= 0.5 * depth
+        return resolved
+
+    def _foretold(self, before: Array, after: Array, radius: Array) -> Array:
+        """Return the force between two nodes by Hermite's cubic."""
         rows = self.rows
         width = self.radius[rows, after] - self.radius[rows, before]
         x = (radius - self.radius[rows, before]) / width
-        force_a, force_b = self.force[rows, before], self.force[rows, after]
-        rise = force_b - force_a
+        rise = self.force[rows, after] - self.force[rows, before]
         a = self.force_climb[rows, before] * width - rise
         b = rise - self.force_climb[rows, after] * width
-        foretold = force_a + x * rise + x * (1 - x) * (a * (1 - x) + b * x)
-        depth = np.maximum(force_a, force_b) - force
-        resolved: NDArray[np.bool_] = np.abs(foretold - force) <= 0.5 * depth
-        return resolved
+        force: Array = self.force[rows, before] + x * rise + x * (1 - x) * (a * (1 - x) + b * x)
+        return force
 
     def _hides_minimum(self, last: Array) -> NDArray[np.bool_]:
         """Whether the force has several minima, or rises between two nodes at both of which it falls or the reverse."""
@@ -418,6 +423,8 @@ class _Refinement:
             return zero, error
         k = np.maximum(np.argmax(tensile, axis=1), 1)
         radius, t = self._root(0, k - 1, k, moving)
+        step = np.abs(self._foretold(k - 1, k, radius))
+        self.fine &= ~moving | (step <= 0.1 * np.abs(self.force[self.rows, k - 1] - self.force[self.rows, k]))
         free_edge = self.cone.edge(radius[:, None])
         free = self.cone.position(free_edge, t[:, None])[:, 0]
         zero[moving] = free[moving]
