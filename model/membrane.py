@@ -211,8 +211,9 @@ def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter) ->
         found = Found(pieces, read, errors)
         if relative <= tolerance or relative > 0.5 * before:
             break
-    if relative > ACCEPTABLE:
-        raise NotConverged(f"membrane: F_p or D_p is uncertain by {relative:.1e} at the highest order")
+    lost = max(errors.force / abs(read.peak.pull or 1.0), errors.detachment / max(read.travel, 1e-300))
+    if lost > ACCEPTABLE:
+        raise NotConverged(f"membrane: F_p or the detachment is uncertain by {lost:.1e} at the highest order")
     return found
 
 
@@ -236,7 +237,10 @@ def _zero_error(scaled: Scene, read: Features, counter: Counter) -> float:
     lift = float(panel.height.deriv()(read.zero.coordinate))
     height, pull = _change(scaled.annulus, read.zero, counter)
     pull += panel.tail * abs(read.peak.pull)
-    return read.gap + height + (pull * abs(lift / slope) if slope else 0.0)
+    own = height + (pull * abs(lift / slope) if slope else 0.0)
+    piece = read.zero.piece
+    rise = float(panel.height(piece.end) - panel.height(piece.begin))
+    return read.gap + min(own, rise)  # the zero lies on its piece, however slack the membrane is there
 
 
 def _change(annulus: Annulus, place: Place, counter: Counter) -> tuple[float, float]:
@@ -255,7 +259,7 @@ def _change(annulus: Annulus, place: Place, counter: Counter) -> tuple[float, fl
 
 def _relative(read: Features, errors: Errors) -> float:
     distance = read.detachment.height - (read.start if read.zero is None else read.zero).height
-    travel = max(abs(distance), 1e-3 * abs(read.detachment.height - read.start.height), 1e-300)
+    travel = max(abs(distance), 1e-3 * read.travel, 1e-300)
     return max(errors.force / max(abs(read.peak.pull), 1e-300), (errors.zero + errors.detachment) / travel)
 
 
@@ -289,8 +293,14 @@ def _prediction(scaled: Scene, found: Found, empty: Prediction, points: int) -> 
             "zero_force_position": length * errors.zero,
             "detachment_position": length * errors.detachment,
         },
-        warnings=tuple(_warnings(scaled, pieces)),
+        warnings=tuple(_warnings(scaled, pieces) + _doubts(read, errors)),
     )
+
+
+def _doubts(read: Features, errors: Errors) -> list[str]:
+    if errors.zero <= ACCEPTABLE * read.travel:
+        return []
+    return ["the membrane is slack where the force vanishes: D_p is uncertain as numerical_error says"]
 
 
 def _jumps(scaled: Scene, pieces: list[Piece]) -> tuple[Jump, ...]:

@@ -25,6 +25,8 @@ SMALLEST_CONTACT = 3.9
 LAST_WIDTH = 14.0
 NARROW_STRIP = 0.05
 """Width at which the closed form of the strip starts every solution."""
+FOLD_SLOPE = 0.25
+"""Rise of the release rate with the rim, relative to that without load, below which it counts as vanishing."""
 WIDE_ANNULUS = 1.0
 """Width at which a sliding contact is entered."""
 FOLD_RATE = 5.0
@@ -121,10 +123,13 @@ def _raise_load(annulus: Annulus, width: float, closure: Closure, height: float,
         target = (1 - fraction) * lifted + fraction * height
         return _accepted(_at_fraction(annulus, fraction), widths, guess, closure, target, counter)
 
-    line = follow(solve_at, 0.0, rest, 1.0, step=0.5, smallest=1e-7)
+    line = follow(solve_at, 0.0, rest, 1.0, step=0.5, smallest=1e-11)
     if line.coordinate[-1] == 1.0:
         return Start(line.state[-1:], turned=False)
-    return Start(None, turned=_turned(line, widths))
+    first, last = (
+        release_slope(_at_fraction(annulus, float(line.coordinate[i])), widths, line.state[[i]])[0] for i in (0, -1)
+    )
+    return Start(None, turned=_turned(line, widths) or bool(last < FOLD_SLOPE * first))
 
 
 def _flat_state(flat: Annulus, width: float, counter: Counter, order: int) -> Array | None:

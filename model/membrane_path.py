@@ -92,6 +92,11 @@ class Features(NamedTuple):
     detachment: Place
     energy: float
 
+    @property
+    def travel(self) -> float:
+        """Height from z_0 to detachment."""
+        return self.detachment.height - self.start.height
+
 
 class Resolution(NamedTuple):
     """How well a line is to be resolved: order of the shapes, relative size of the last terms of the series."""
