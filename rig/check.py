@@ -52,10 +52,10 @@ def _pressure(scene: Scene, bench: Bench) -> list[str]:
         reasons.append(f"initial_pressure_kPa = {pressure:g} lies outside the bench's {low:g} to {high:g} kPa")
     atmosphere = scene.gas.atmospheric_pressure_kPa
     needed = scene.gripper.chamber_volume_ml * abs(pressure) / (atmosphere + pressure)
-    available = bench.pump.syringe_volume_ml / 2
+    available = 0.8 * bench.pump.syringe_volume_ml
     if needed > available:
         reasons.append(
-            f"reaching {pressure:g} kPa takes about {needed:.2f} ml, half the syringe holds {available:g} ml; "
+            f"reaching {pressure:g} kPa takes about {needed:.2f} ml, {available:g} ml of the syringe can be used; "
             "fit a larger syringe"
         )
     return reasons

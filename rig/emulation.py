@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from typing import TYPE_CHECKING
+
+from rig.observe import Controls, Event, Watcher
 
 if TYPE_CHECKING:
     from drivers.emulated.bench import EmulatedBench
+    from drivers.emulated.electronics import Device
     from drivers.emulated.truth import Truth
+    from rig.bench import Bench
     from rig.scene import Scene
     from rig.session import Request
 
@@ -22,20 +28,73 @@ def emulated_bench(request: Request) -> EmulatedBench:
         faults=request.faults,
         wire=request.wire,
         pressure=request.scene.uses_pressure,
+        device=_device(request.bench),
     )
 
 
 def truth(scene: Scene, seed: int) -> Truth:
     """Return a world with the scene's geometry; its membrane is never the scene's."""
+    from drivers.emulated.chamber import Chamber
+    from drivers.emulated.specimens import DeadWeight, RigidStop
     from drivers.emulated.truth import Truth
 
-    diameter = scene.substrate.diameter_mm
+    gripper = scene.gripper
+    diameter = None if scene.substrate.diameter_mm is None else scene.substrate.diameter_mm * 1e-3
+    volume = gripper.chamber_volume_ml * 1e-6
+    special: dict[str, Callable[[], Truth]] = {
+        "indentation": lambda: Truth.indentation(seed=seed),
+        "fiber": lambda: Truth.fibers(seed=seed),
+        "punch": lambda: Truth.punch(radius=gripper.effective_radius_mm * 1e-3, seed=seed),
+        "volume": lambda: Truth.closed(chamber_volume=volume, seed=seed),
+        "leak": lambda: Truth.closed(chamber_volume=volume, seed=seed),
+        "pressure_zero": lambda: Truth.closed(chamber_volume=volume, seed=seed),
+        "compliance": lambda: Truth(RigidStop(), Chamber(vented=True)),
+        "dead_weights": lambda: Truth(DeadWeight(0.0), Chamber(vented=True)),
+    }
+    kind = "punch" if gripper.kind == "punch" else scene.protocol.name
+    if kind in special:
+        return special[kind]()
+    if gripper.kind == "soft":
+        return Truth.soft(diameter if scene.substrate.shape == "sphere" else None, chamber_volume=volume, seed=seed)
     return Truth.pull_off(
         scene.substrate.shape,
-        None if diameter is None else diameter * 1e-3,
-        radius=scene.gripper.radius_mm * 1e-3,
-        effective_radius=scene.gripper.effective_radius_mm * 1e-3,
-        chamber_volume=scene.gripper.chamber_volume_ml * 1e-6,
+        diameter,
+        radius=gripper.radius_mm * 1e-3,
+        effective_radius=gripper.effective_radius_mm * 1e-3,
+        chamber_volume=volume,
         vented=not scene.uses_pressure,
         seed=seed,
     )
+
+
+def _device(bench: Bench) -> Device:
+    """Return the DAQ with the load cell the bench names; its noise is that of its capacity."""
+    from drivers.emulated.electronics import Cell, usb_6211
+
+    force = bench.force
+    cell = Cell(
+        name=force.cell,
+        capacity=force.capacity_N,
+        sensitivity=1 / force.calibration.slope,
+        noise=4e-5 * force.capacity_N,
+    )
+    return usb_6211(cell=cell)
+
+
+class Hands(Watcher):
+    """The emulated operator: does what a prompt asks and lets the run go on."""
+
+    def __init__(self, controls: Controls, world: EmulatedBench) -> None:
+        self._controls = controls
+        self._world = world
+
+    def event(self, event: Event) -> None:
+        """Answer a prompt."""
+        if event.kind != "prompt":
+            return
+        hung = re.match(r"hang ([0-9.e+-]+) g", event.text)
+        if hung:
+            from drivers.emulated.specimens import DeadWeight
+
+            self._world.plant.mount(DeadWeight(float(hung[1]) * 1e-3))
+        self._controls.resume()

@@ -70,7 +70,7 @@ def open_instruments(request: Request) -> Opened:
 
 
 def _open_emulated(request: Request) -> Opened:
-    from rig.emulation import emulated_bench
+    from rig.emulation import Hands, emulated_bench
 
     emulated = emulated_bench(request)
     try:
@@ -86,7 +86,7 @@ def _open_emulated(request: Request) -> Opened:
         emulated.close()
         raise
     opened.virtual = request.speed is None
-    opened.observers.append(_StepsToFaults(emulated))
+    opened.observers += [_StepsToFaults(emulated), Hands(request.controls, emulated)]
     opened.shut_down = emulated.close
     return opened
 
@@ -158,7 +158,7 @@ def open_pump(bench: Bench, clock: Clock = time.perf_counter, connections: dict[
 def open_daq(bench: Bench, pressure: bool, connections: dict[str, str] | None = None) -> Daq:
     """Open one task with the channels the scene needs; sampling has not begun."""
     from drivers.daq import NIDaq
-    from drivers.daq_channels import BridgeChannel, Channel, VoltageChannel, signal_channel, signal_channel
+    from drivers.daq_channels import BridgeChannel, Channel, VoltageChannel, signal_channel
 
     part = bench.force
     channels: list[Channel] = []

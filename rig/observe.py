@@ -88,7 +88,8 @@ class StepEvent:
 class Event:
     """One line of the log.
 
-    ``kind``: ``command`` (to an instrument), ``operator``, ``note``, ``warning``, ``fault``, ``interlock`` or ``end``.
+    ``kind`` is ``command``, ``operator``, ``prompt``, ``note``, ``warning``, ``timing``, ``fault``, ``interlock`` or
+    ``end``.
     """
 
     sample: int

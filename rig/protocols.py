@@ -2,18 +2,47 @@
 
 from __future__ import annotations
 
-from rig.scene import PullOffSection, Scene
+from rig.scene import (
+    ComplianceSection,
+    ContactSection,
+    DeadWeightsSection,
+    LeakSection,
+    PressureZeroSection,
+    PullOffSection,
+    Scene,
+    VolumeSection,
+)
+from sequences import calibration, chamber
+from sequences.pressurize import Chamber
 from sequences.pull_off import PullOff, PullOffSettings
 from sequences.step import Apparatus, Step
 
 
 def build_steps(scene: Scene, apparatus: Apparatus) -> list[Step]:
     """Return the steps of the scene's protocol."""
-    return PullOff(apparatus, _pull_off(scene, scene.protocol)).steps()
+    protocol = scene.protocol
+    if isinstance(protocol, VolumeSection):
+        strokes = [stroke * 1e-6 for stroke in protocol.strokes_ml]
+        return chamber.volume(apparatus, _chamber(scene), strokes, protocol.settle_s)
+    if isinstance(protocol, LeakSection):
+        pressure, tolerance = protocol.initial_pressure_kPa * 1e3, protocol.pressure_tolerance_kPa * 1e3
+        return chamber.leak(apparatus, _chamber(scene), pressure, tolerance, protocol.hold_s)
+    if isinstance(protocol, DeadWeightsSection):
+        masses = [mass * 1e-3 for mass in protocol.masses_g]
+        return calibration.dead_weights(apparatus, masses, protocol.rest_s)
+    if isinstance(protocol, PressureZeroSection):
+        return calibration.pressure_zero(apparatus, protocol.rest_s)
+    test = PullOff(apparatus, contact_settings(scene, protocol))
+    if isinstance(protocol, ComplianceSection):
+        back = calibration.unload(apparatus, protocol.retract_speed_um_s * 1e-6, protocol.unload_um * 1e-6)
+        return [*test.contact_steps(), back]
+    return test.steps()
 
 
-def _pull_off(scene: Scene, protocol: PullOffSection) -> PullOffSettings:
-    pressure = protocol.initial_pressure_kPa
+def contact_settings(scene: Scene, protocol: ContactSection) -> PullOffSettings:
+    """Return the settings of a test that touches a sample, SI."""
+    gas = protocol if isinstance(protocol, PullOffSection) else PullOffSection()
+    pressure = gas.initial_pressure_kPa
     return PullOffSettings(
         preload=protocol.preload_N,
         approach_speed=protocol.approach_speed_um_s * 1e-6,
@@ -22,7 +51,11 @@ def _pull_off(scene: Scene, protocol: PullOffSection) -> PullOffSettings:
         tare=protocol.tare_s,
         contact_force=protocol.contact_force_mN * 1e-3,
         initial_pressure=None if pressure is None else pressure * 1e3,
-        pressure_tolerance=protocol.pressure_tolerance_kPa * 1e3,
+        pressure_tolerance=gas.pressure_tolerance_kPa * 1e3,
         chamber_volume=scene.gripper.chamber_volume_ml * 1e-6,
         atmospheric_pressure=scene.gas.atmospheric_pressure_kPa * 1e3,
     )
+
+
+def _chamber(scene: Scene) -> Chamber:
+    return Chamber(scene.gripper.chamber_volume_ml * 1e-6, scene.gas.atmospheric_pressure_kPa * 1e3)

@@ -302,7 +302,7 @@ class Verification:
             self.differences.append(f"{len(recorded)} {what}s recorded, {len(ours)} replayed")
 
 
-_DERIVED = {"note", "command", "operator"}
+_DERIVED = {"note", "command", "operator", "prompt"}
 
 
 def _timeless(text: str) -> Any:

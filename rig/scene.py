@@ -70,12 +70,9 @@ class GasSection(Section):
     atmospheric_pressure_kPa: Annotated[float, Field(gt=0, le=200)] = 101.3
 
 
-class PullOffSection(Section):
-    """``[protocol]`` of a pull-off test. Without ``initial_pressure_kPa`` the chamber is vented: no pump, no sensor."""
+class ContactSection(Section):
+    """What every test that touches a sample has in common."""
 
-    name: Literal["pull_off"] = "pull_off"
-    initial_pressure_kPa: Annotated[float, Field(gt=-101.3, le=1000)] | None = None
-    pressure_tolerance_kPa: Annotated[float, Field(gt=0, le=10)] = 0.05
     preload_N: Annotated[float, Field(gt=0, le=50)] = 0.5
     approach_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 100.0
     retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 10.0
@@ -84,7 +81,110 @@ class PullOffSection(Section):
     contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 10.0
 
 
-ProtocolSection = PullOffSection
+class PullOffSection(ContactSection):
+    """``[protocol]`` of a pull-off test. Without ``initial_pressure_kPa`` the chamber is vented: no pump, no sensor."""
+
+    name: Literal["pull_off"] = "pull_off"
+    initial_pressure_kPa: Annotated[float, Field(gt=-101.3, le=1000)] | None = None
+    pressure_tolerance_kPa: Annotated[float, Field(gt=0, le=10)] = 0.05
+
+
+class IndentationSection(ContactSection):
+    """``[protocol]`` of the JKR test (PNAS SI S4): a glass sphere on the film, one recording a position."""
+
+    name: Literal["indentation"]
+    preload_N: Annotated[float, Field(gt=0, le=50)] = 0.1
+    retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 50.0
+    contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 3.0
+    indenter_radius_mm: Annotated[float, Field(gt=0, le=1000)] = 4.0
+    positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
+        "top",
+        "center",
+        "bottom",
+        "left",
+        "right",
+    )
+
+
+class FiberSection(ContactSection):
+    """``[protocol]`` of the test of a few fibres (PNAS SI S5): three samples, five repeats of each."""
+
+    name: Literal["fiber"]
+    preload_N: Annotated[float, Field(gt=0, le=50)] = 1e-3
+    approach_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    preload_dwell_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
+    contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 0.15
+    fibers: Annotated[int, Field(ge=1)] = 3
+    real_area_um2: Annotated[float, Field(gt=0)] | None = None
+    projected_area_um2: Annotated[float, Field(gt=0)] | None = None
+    positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = ("SPL#1", "SPL#2", "SPL#3")
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 5
+
+
+class PunchSection(ContactSection):
+    """``[protocol]`` of the pull-off of fibres on a rigid punch (EML Fig. 3e)."""
+
+    name: Literal["punch"]
+
+
+class VolumeSection(Section):
+    """``[protocol]`` of the volume test: pump strokes against pressure give V_0; the chamber closed by a plate."""
+
+    name: Literal["volume"]
+    strokes_ml: Annotated[tuple[float, ...], Field(min_length=2, strict=False)] = (-0.1, -0.1, 0.2, 0.1, -0.1)
+    settle_s: Annotated[float, Field(ge=0.5, le=3600)] = 3.0
+
+
+class LeakSection(Section):
+    """``[protocol]`` of the leak test: bring the closed chamber to a pressure and watch it."""
+
+    name: Literal["leak"]
+    initial_pressure_kPa: Annotated[float, Field(gt=-101.3, le=1000)] = -3.0
+    pressure_tolerance_kPa: Annotated[float, Field(gt=0, le=10)] = 0.1
+    hold_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
+
+
+class ComplianceSection(ContactSection):
+    """``[protocol]`` of the compliance calibration: press a rigid stop and back away."""
+
+    name: Literal["compliance"]
+    preload_N: Annotated[float, Field(gt=0, le=50)] = 1.0
+    approach_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 2.0
+    unload_um: Annotated[float, Field(gt=0, le=1000)] = 60.0
+
+
+class DeadWeightsSection(Section):
+    """``[protocol]`` of the load cell calibration: masses hung one after the other, up and down."""
+
+    name: Literal["dead_weights"]
+    masses_g: Annotated[tuple[float, ...], Field(min_length=2, strict=False)] = (0.0, 20.0, 50.0, 100.0, 200.0)
+    rest_s: Annotated[float, Field(ge=0.5, le=600)] = 2.0
+
+
+class PressureZeroSection(Section):
+    """``[protocol]`` of the pressure sensor's zero: port open to the room."""
+
+    name: Literal["pressure_zero"]
+    rest_s: Annotated[float, Field(ge=0.5, le=600)] = 2.0
+
+
+ProtocolSection = Annotated[
+    PullOffSection
+    | IndentationSection
+    | FiberSection
+    | PunchSection
+    | VolumeSection
+    | LeakSection
+    | ComplianceSection
+    | DeadWeightsSection
+    | PressureZeroSection,
+    Field(discriminator="name"),
+]
+
+WITH_CHAMBER = frozenset({"volume", "leak", "pressure_zero"})
+"""Protocols that always need pump and pressure sensor."""
 
 
 class Scene(Section):
@@ -100,7 +200,16 @@ class Scene(Section):
     @property
     def uses_pressure(self) -> bool:
         """Whether the scene needs the pump and the pressure sensor."""
-        return getattr(self.protocol, "initial_pressure_kPa", None) is not None
+        return self.protocol.name in WITH_CHAMBER or getattr(self.protocol, "initial_pressure_kPa", None) is not None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pull_off_is_the_usual_protocol(cls, content: Any) -> Any:
+        """A ``[protocol]`` that names none is a pull-off test."""
+        protocol = content.get("protocol") if isinstance(content, dict) else None
+        if isinstance(protocol, dict) and "name" not in protocol:
+            return {**content, "protocol": {"name": "pull_off", **protocol}}
+        return content
 
     def parameters(self, pressure_kPa: float | None = None) -> Parameters:
         """Return the model's parameters, SI; ``pressure_kPa`` replaces the scene's P_0.

@@ -32,14 +32,16 @@ def summarise(path: Path, model: str = "cone") -> str:
     analysis = analyze(run)
     prediction: Prediction | None = None
     note = ""
-    if run.parameters is not None:
+    modelled = run.protocol == "pull_off" and run.settings.get("gripper") == "rigid"
+    if run.parameters is not None and modelled:
         try:
             prediction = predict(run.parameters, model)
         except ModelError as error:
             note = f"\nno prediction: {error}"
     picture = path.with_suffix(".png")
     overview(run, analysis, prediction, picture)
-    return f"{_table(analysis, prediction)}{note}\nrecording  {path}\npicture    {picture}"
+    table = _table(analysis, prediction) if run.protocol == "pull_off" else _list(analysis)
+    return f"{table}{note}\nrecording  {path}\npicture    {picture}"
 
 
 def _table(analysis: Analysis, prediction: Prediction | None) -> str:
@@ -58,3 +60,8 @@ def _table(analysis: Analysis, prediction: Prediction | None) -> str:
         error = prediction.numerical_error.get("pull_off_force", math.nan)
         lines.append(f"{model}: numerical error of F_p {error:.1e} N, solved in {prediction.runtime_s * 1e3:.2f} ms")
     return "\n".join(lines)
+
+
+def _list(analysis: Analysis) -> str:
+    """Return every feature found, a line each."""
+    return "\n".join(f"{name:<40}{quantity}" for name, quantity in analysis.features.items())

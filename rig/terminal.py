@@ -8,7 +8,7 @@ from typing import TextIO
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase, Watcher
 
 _SCALES = {"N": ("N", 1.0), "Pa": ("kPa", 1e-3), "s": ("s", 1.0), "m": ("mm", 1e3)}
-_SHOWN = {"warning", "fault", "interlock", "operator"}
+_SHOWN = {"warning", "fault", "interlock", "operator", "prompt"}
 
 
 class Terminal(Watcher):

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.interfaces import Pump, PumpState
 from sequences.errors import StepFailed
 from sequences.frame import Frame
-from sequences.step import Apparatus, Motion, Step, Steps, stopping_on_failure
+from sequences.pressurize import Chamber, Pressurizer
+from sequences.step import Apparatus, Motion, Step, Steps, rest, stopping_on_failure
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +34,6 @@ class PullOffSettings:
     return_speed: float = 500e-6
     longest_retraction: float = 12e-3
     tail: float = 5.0
-    pump_seconds: float = 4.0
 
 
 class PullOff:
@@ -53,12 +51,7 @@ class PullOff:
     def steps(self) -> list[Step]:
         """Return the steps this scene needs, in order."""
         s = self._settings
-        steps = [
-            Step("tare", f"{s.tare:g} s without contact", self._tare),
-            Step("approach", f"force above {s.contact_force * 1e3:g} mN", self._approach),
-            Step("preload", f"force reaches {s.preload:g} N", self._preload),
-            Step("dwell", f"{s.dwell:g} s at rest", self._dwell),
-        ]
+        steps = [*self.contact_steps(), Step("dwell", f"{s.dwell:g} s at rest", self._dwell)]
         if s.initial_pressure is not None:
             words = f"P_a = {s.initial_pressure / 1e3:+g} kPa within {s.pressure_tolerance / 1e3:g} kPa"
             steps.append(Step("pressurize", words, self._pressurize))
@@ -67,6 +60,15 @@ class PullOff:
             Step("retract", "the tension has passed its peak", self._retract),
             Step("pull-off", f"no force for {s.tail:g} s", self._pull_off),
             Step("return", "back at the starting height", self._return),
+        ]
+
+    def contact_steps(self) -> list[Step]:
+        """Return the steps up to the preload."""
+        s = self._settings
+        return [
+            Step("tare", f"{s.tare:g} s without contact", self._tare),
+            Step("approach", f"force above {s.contact_force * 1e3:g} mN", self._approach),
+            Step("preload", f"force reaches {s.preload:g} N", self._preload),
         ]
 
     def _force(self, frame: Frame) -> float:
@@ -143,66 +145,15 @@ class PullOff:
         return min(self._settings.approach_speed, max(left / stiffness / 0.25, 1e-6))
 
     def _dwell(self, frame: Frame) -> Steps:
-        begin = frame.stop
-        while frame.stop - begin < self._settings.dwell * frame.rate:
-            frame = yield
-            self._apparatus.tell.progress((frame.stop - begin) / frame.rate, self._settings.dwell, "s")
-        return frame
+        return rest(self._apparatus, self._settings.dwell, frame)
 
     def _pressurize(self, frame: Frame) -> Steps:
-        pump, goal = self._apparatus.pump, self._settings.initial_pressure
-        if pump is None or goal is None:  # the scene's check keeps this from happening
-            raise StepFailed("pressurize", "the bench has no pump", "add [pump] and [pressure] to the bench")
-        try:
-            volume = self._settings.chamber_volume
-            for _ in range(12):
-                frame = yield from _wait(frame, 1.0)
-                pressure, frame = yield from self._mean_pressure(frame, 0.5)
-                if abs(pressure - goal) <= 0.6 * self._settings.pressure_tolerance:
-                    self._apparatus.tell.note(f"P_0 reached: {pressure / 1e3:+.3f} kPa")
-                    return frame
-                displaced = volume * (goal - pressure) / (self._settings.atmospheric_pressure + goal)
-                frame = yield from self._dispense(pump, displaced, frame)
-        finally:
-            pump.stop()
-        raise StepFailed(
-            "pressurize",
-            f"P_a stays at {pressure / 1e3:+.3f} kPa, {goal / 1e3:+g} kPa wanted",
-            "look for a leak, check chamber_volume_ml and the syringe diameter",
-        )
-
-    def _dispense(self, pump: Pump, volume: float, frame: Frame) -> Steps:
-        slowest, fastest = pump.rate_limits
-        rate = min(max(abs(volume) / self._settings.pump_seconds, 2 * slowest), 0.9 * fastest)
-        before = frame.pump
-        pump.dispense(volume, rate)
-        deadline = frame.stop + int((3 * abs(volume) / rate + 5) * frame.rate)
-        while frame.pump is before or frame.pump is None or frame.pump.state in _RUNNING:
-            frame = yield
-            self._show_pressure(frame)
-            if frame.stop > deadline:
-                raise StepFailed("pressurize", "the pump did not reach its target volume", "look at the pump's screen")
-        if frame.pump.state in (PumpState.STALLED, PumpState.AT_LIMIT):
-            raise StepFailed(
-                "pressurize",
-                f"the pump is {frame.pump.state} after {frame.pump.volume * 1e6:.4f} ml",
-                "free the syringe, check its travel and the force setting, then run again",
-            )
-        return frame
-
-    def _mean_pressure(self, frame: Frame, seconds: float) -> Generator[None, Frame, tuple[float, Frame]]:
-        blocks: list[float] = []
-        begin = frame.stop
-        while frame.stop - begin < seconds * frame.rate:
-            frame = yield
-            if frame.pressure is not None:
-                blocks.append(float(frame.pressure.mean()))
-            self._show_pressure(frame)
-        return float(np.mean(blocks)), frame
-
-    def _show_pressure(self, frame: Frame) -> None:
-        if frame.pressure is not None:
-            self._apparatus.tell.progress(float(frame.pressure.mean()), self._settings.initial_pressure or 0.0, "Pa")
+        goal = self._settings.initial_pressure
+        if goal is None:  # such a scene has no pressurize step
+            return frame
+        chamber = Chamber(self._settings.chamber_volume, self._settings.atmospheric_pressure)
+        gas = Pressurizer(self._apparatus, chamber, self._settings.pressure_tolerance, "pressurize")
+        return (yield from gas.bring_to(goal, frame))
 
     def _retract(self, frame: Frame) -> Steps:
         motion = self._retraction(frame)
@@ -264,9 +215,9 @@ class PullOff:
         )
 
     def _return(self, frame: Frame) -> Steps:
-        """Go up to the starting height; away from the sample the whole way is commanded at once."""
+        """Go up to the starting height."""
         target = max(self._start_height, frame.stage.position)
-        motion = Motion(self._apparatus, target, self._settings.return_speed, look_ahead=math.inf)
+        motion = Motion(self._apparatus, target, self._settings.return_speed)
         seconds = 3 * (target - frame.stage.position) / self._settings.return_speed + 5
         deadline = frame.stop + round(seconds * frame.rate)
         try:
@@ -279,13 +230,3 @@ class PullOff:
         finally:
             self._apparatus.stage.stop()
         return frame
-
-
-_RUNNING = (PumpState.INFUSING, PumpState.WITHDRAWING)
-
-
-def _wait(frame: Frame, seconds: float) -> Steps:
-    begin = frame.stop
-    while frame.stop - begin < seconds * frame.rate:
-        frame = yield
-    return frame

@@ -37,6 +37,10 @@ class Teller(Protocol):
         """Something the log should hold."""
         ...
 
+    def ask(self, text: str) -> None:
+        """Ask the operator for a hand: no further frame comes before the run is resumed."""
+        ...
+
 
 @dataclass(frozen=True)
 class Apparatus:
@@ -74,6 +78,15 @@ def play(steps: Sequence[Step], tell: Teller) -> Generator[None, Frame, None]:
             outcome = "done"
         finally:
             tell.ended(step.name, outcome)
+
+
+def rest(apparatus: Apparatus, seconds: float, frame: Frame) -> Steps:
+    """Let so much time pass, counted in samples."""
+    begin = frame.stop
+    while frame.stop - begin < seconds * frame.rate:
+        frame = yield
+        apparatus.tell.progress((frame.stop - begin) / frame.rate, seconds, "s")
+    return frame
 
 
 @contextmanager
