@@ -168,7 +168,9 @@ def test_nonsense_is_refused():
 
 @pytest.fixture(scope="module")
 def cycles():
-    return {pressure: pull(still(Truth.pull_off("sphere", 60e-3)), pressure, speed=2e-5) for pressure in (1600.0, -3200.0)}
+    return {
+        pressure: pull(still(Truth.pull_off("sphere", 60e-3)), pressure, speed=2e-5) for pressure in (1600.0, -3200.0)
+    }
 
 
 def test_suction_holds_harder_and_over_a_shorter_distance(cycles):
@@ -291,6 +293,33 @@ def test_whatever_is_commanded_the_world_goes_on(substrate, commands, seed):
         plant.axis.move(truth.train.contact_position + target, speed, 0.1, 0.1)
         plant.syringe.run(math.copysign(5e-7, volume), abs(volume))
         for signal in plant.advance(samples, RATE).values():
+            assert np.all(np.isfinite(signal))
+
+
+@given(
+    st.sampled_from(["sphere", "flat"]),
+    st.floats(-4, 1),
+    st.floats(-4, -1),
+    st.floats(0.2, 1.0),
+    st.floats(-9, -3),
+    st.lists(st.tuples(st.floats(-1, 1), st.floats(-5, -2), st.floats(-0.9, 0.9)), min_size=1, max_size=4),
+)
+@settings(max_examples=40, deadline=None)
+def test_absurd_geometries_are_worlds_too(shape, diameter, radius, share, volume, commands):
+    """Diameters from 0.1 mm to 10 m, grippers from 0.1 mm to 0.1 m, chambers from a microlitre to a litre."""
+    truth = Truth.pull_off(
+        shape,
+        10**diameter,
+        radius=10**radius,
+        effective_radius=share * 10**radius,
+        chamber_volume=10**volume,
+    )
+    plant = Plant(truth)
+    for depth, speed, stroke in commands:
+        target = truth.train.contact_position + depth * min(3 * 10**radius, 18e-3)
+        plant.axis.move(target, 10**speed, 0.1, 0.1)
+        plant.syringe.run(math.copysign(10**volume, stroke), abs(stroke) * 10**volume)
+        for signal in plant.advance(500, RATE).values():
             assert np.all(np.isfinite(signal))
 
 

@@ -10,6 +10,7 @@ Beside the contact, the film-covered rim of the gripper touches the substrate, s
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass, field
 
@@ -23,8 +24,8 @@ FREE_DEFLECTION = 0.59488
 FREE_VOLUME = 0.965163
 """Its volume over R_0^3 (p R_0 / E h)^(1/3)."""
 
-SEED_RADIUS = 60e-6
-"""A contact begins and ends at this radius, about one fibre, m."""
+FIBER = 60e-6
+"""A contact begins and ends with about one fibre, m."""
 
 PRESSURE_STEP = 5.0
 """Newton's correction (Pa) below which the remaining error is far under the sensor's noise."""
@@ -33,6 +34,10 @@ HEIGHT_STEP = 5e-8
 """The same for the height, m."""
 
 ITERATIONS = 60
+
+
+class NoEquilibrium(ArithmeticError):
+    """Film, gas and load train cannot balance at this contact radius."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,10 @@ class AdhesiveMembrane:
         The film laid on a sphere stores E h a^4 / (contact_strain r_b^4) per area.
     rim_stiffness, tilt
         N/m of the fully seated rim; angle between rim and substrate, rad.
+    largest_radius, smallest_radius
+        Of a contact, m (derived).
+    seat
+        Height at which the untilted rim touches, m; far below everything where it never does (derived).
     """
 
     substrate_diameter: float | None = 60e-3
@@ -68,6 +77,14 @@ class AdhesiveMembrane:
     contact_strain: float = 270.0
     rim_stiffness: float = 60e3
     tilt: float = 1e-3
+    largest_radius: float = field(init=False, repr=False, compare=False)
+    smallest_radius: float = field(init=False, repr=False, compare=False)
+    seat: float = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "largest_radius", self._largest_radius())
+        object.__setattr__(self, "smallest_radius", min(FIBER, 0.1 * self.largest_radius))
+        object.__setattr__(self, "seat", self._seat())
 
     def step(
         self,
@@ -79,34 +96,46 @@ class AdhesiveMembrane:
         chamber: Chamber,
         stiffness: float,
     ) -> State:
-        """Move the contact line, then balance film, gas and load train."""
+        """Move the contact line, then balance film, gas and load train; without a balance the film is drawn off."""
         world = (height, delivered, amount, chamber, stiffness)
-        if state.radius == 0.0:
-            return self._step_free(state, duration, *world)
         radius = min(state.radius + state.speed * duration, self.largest_radius)
-        if radius < SEED_RADIUS:
+        if radius < self.smallest_radius:
             return self._step_free(state, duration, *world)
+        try:
+            return self._step_in_contact(state, duration, radius, *world)
+        except NoEquilibrium:
+            return self._step_free(state, duration, *world)
+
+    def _step_in_contact(
+        self,
+        state: State,
+        duration: float,
+        radius: float,
+        height: float,
+        delivered: float,
+        amount: float,
+        chamber: Chamber,
+        stiffness: float,
+    ) -> State:
+        """Balance at the predicted radius, and again at the corrected one where they differ."""
+        world = (height, delivered, amount, chamber, stiffness)
         after = self._balance(state, radius, *world)
         slip = 0.0
         if after[4] != state.speed:
             better = min(state.radius + 0.5 * (state.speed + after[4]) * duration, self.largest_radius)
             slip = line_error(better - radius, radius - state.radius)
-            if slip > 0.1 and better > SEED_RADIUS:
+            if slip > 0.1 and better > self.smallest_radius:
                 after = self._balance(state, better, *world)
         return finish(state, duration, *after, slip)
 
-    @property
-    def largest_radius(self) -> float:
-        """Largest possible contact radius, m."""
+    def _largest_radius(self) -> float:
         if self.disk_diameter is not None:
             return min(self.effective_radius, self.disk_diameter / 2)
         if self.substrate_diameter is not None:
             return min(self.effective_radius, 0.49 * self.substrate_diameter)
         return self.effective_radius
 
-    @property
-    def seat(self) -> float:
-        """Height at which the untilted rim touches, m; far below everything where it never does."""
+    def _seat(self) -> float:
         if self.substrate_diameter is not None:
             sphere = self.substrate_diameter / 2
             if sphere <= self.radius:
@@ -140,11 +169,11 @@ class AdhesiveMembrane:
         inflation = 0.0 if chamber.vented else self._inflate(state, delivered, amount, chamber)
         pressure = 0.0 if chamber.vented else self._film / self.radius * inflation**3
         if height < FREE_DEFLECTION * self.radius * inflation:
-            touching = self._balance(
-                State(pressure=pressure, height=height), SEED_RADIUS, height, delivered, amount, chamber, stiffness
-            )
-            if touching[4] >= 0.0:
-                return finish(state, duration, *touching)
+            begun = State(pressure=pressure, height=height)
+            with contextlib.suppress(NoEquilibrium):  # then it does not hold yet
+                touching = self._balance(begun, self.smallest_radius, height, delivered, amount, chamber, stiffness)
+                if touching[4] >= 0.0:
+                    return finish(state, duration, *touching)
         force, height = self._seated(height, stiffness)
         return finish(state, duration, force, pressure, height, 0.0, 0.0, inflation)
 
@@ -247,7 +276,7 @@ class AdhesiveMembrane:
             if -HEIGHT_STEP < dz < HEIGHT_STEP and -PRESSURE_STEP < dp < PRESSURE_STEP:
                 break
         else:
-            raise ArithmeticError(f"membrane: no equilibrium at a = {a:g} m, height {height:g} m, pressure {p:g} Pa")
+            raise NoEquilibrium(f"membrane: no equilibrium at a = {a:g} m, height {height:g} m, pressure {p:g} Pa")
         opened = d * d + 16 / 3 * b * b
         release = (
             energy * (x * (R + a) / (a * L) * (d * cap_slope + opened / L) - (_density(y) - _density(base)))
