@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,16 +36,22 @@ def run(arguments: argparse.Namespace) -> int:
         from rig.commands import console
 
         return console.run_with_console(arguments)
-    for repeat in range(1, max(1, arguments.repeat) + 1):
-        request = _request(arguments, repeat)
+    import sys
+
+    for test, request in _requests(arguments):
+        if test.place and not request.bench.is_emulated:
+            print(f"{test.prompt} Press Enter to go on.", file=sys.stderr)
+            sys.stdin.readline()
         ending = _run_once(request, arguments)
         if ending.exit_code:
             return ending.exit_code
     return 0
 
 
-def _request(arguments: argparse.Namespace, repeat: int) -> Request:
+def _requests(arguments: argparse.Namespace) -> Iterator[tuple[PlannedTest, Request]]:
+    """Yield the tests of the scene: its places, each so often."""
     from rig.bench import load_bench
+    from rig.campaign import single
     from rig.errors import FileError
     from rig.library import find_scene
     from rig.scene import parse_scene
@@ -55,23 +62,31 @@ def _request(arguments: argparse.Namespace, repeat: int) -> Request:
     bench, bench_text = load_bench(arguments.bench)
     if not bench.is_emulated and arguments.speed != "max":
         raise FileError("--speed: real instruments run in real time. Remedy: leave it out.")
-    request = Request(
-        scene=scene,
-        scene_text=text,
-        bench=bench,
-        bench_text=bench_text,
-        out=_destination(arguments, Path(source).stem, repeat),
-        seed=arguments.seed + repeat - 1,
-        speed=parse_speed(arguments.speed),
-        wire=not arguments.direct,
-        repeat=repeat,
-        repeats=max(1, arguments.repeat),
-    )
+    faults = None
     if arguments.faults is not None:
         from rig.commands.emulate import load_faults
 
-        request.faults = load_faults(arguments.faults)
-    return request
+        faults = load_faults(arguments.faults)
+    tests = single(scene, text, Path(source).stem, arguments.repeat, arguments.seed)
+    for number, test in enumerate(tests, 1):
+        yield (
+            test,
+            Request(
+                scene=scene,
+                scene_text=text,
+                bench=bench,
+                bench_text=bench_text,
+                out=_destination(arguments.out, test.key, len(tests)),
+                seed=test.seed,
+                speed=parse_speed(arguments.speed),
+                wire=not arguments.direct,
+                live=not arguments.no_live,
+                faults=faults,
+                repeat=number,
+                repeats=len(tests),
+                place=test.place,
+            ),
+        )
 
 
 def parse_speed(text: str) -> float | None:
@@ -89,11 +104,13 @@ def parse_speed(text: str) -> float | None:
     return speed
 
 
-def _destination(arguments: argparse.Namespace, scene: str, repeat: int) -> Path:
+def _destination(out: Path | None, key: str, count: int) -> Path:
+    """Return the recording's path; several tests share ``--out`` as the beginning of their names."""
     from datetime import datetime
 
-    path: Path = arguments.out or Path("recordings") / f"{scene}-{datetime.now():%Y%m%d-%H%M%S}.h5"
-    return path if arguments.repeat <= 1 else path.with_name(f"{path.stem}-{repeat}{path.suffix}")
+    if out is None:
+        return Path("recordings") / f"{key}-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    return out if count == 1 else out.with_name(f"{out.stem}-{key}{out.suffix}")
 
 
 def _run_once(request: Request, arguments: argparse.Namespace) -> Ending:
@@ -108,7 +125,6 @@ def _run_once(request: Request, arguments: argparse.Namespace) -> Ending:
 
         observers.append(LinkServer(request.controls))
     request.observers = observers  # type: ignore[assignment]
-    request.live = not arguments.no_live
     try:
         ending = run_scene(request)
     finally:

@@ -1,0 +1,235 @@
+"""Campaigns: a matrix of scenes, pressures, places and repeats, taken up again where a crash has left it.
+
+Every test is a recording of its own. The journal, one JSON line per finished test, is written and synced after the
+recording is closed; a test without a line is done again under a new name, and what a crash has left is kept.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from rig.errors import FileError
+from rig.library import find_scene
+from rig.scene import Scene, Section, parse_scene, read_text, validate_scene
+from rig.validation import explain
+
+JOURNAL = "journal.jsonl"
+
+
+class EntrySection(Section):
+    """``[[test]]``: a scene, the pressures it is run at, how often, and what the operator has to do before."""
+
+    scene: str
+    initial_pressures_kPa: Annotated[tuple[float, ...], Field(min_length=1, strict=False)] | None = None
+    repeats: Annotated[int, Field(ge=1, le=1000)] | None = None
+    prompt: str = ""
+
+
+class Campaign(Section):
+    """A campaign file."""
+
+    title: str
+    order: Literal["given", "random"] = "given"
+    seed: int = 0
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    test: Annotated[tuple[EntrySection, ...], Field(min_length=1, strict=False)]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTest:
+    """One test of a campaign.
+
+    Attributes
+    ----------
+    key
+        Names the test in the journal and its recording; the same in every process that reads the file.
+    scene_text
+        The scene with the pressure of this test.
+    place
+        Position on the membrane, or sample; empty where the protocol names none.
+    setup
+        Tests with the same setup need no hands between them.
+    prompt
+        What the operator has to do before the first test of a setup.
+    """
+
+    key: str
+    scene: Scene
+    scene_text: str
+    place: str
+    repeat: int
+    repeats: int
+    seed: int
+    setup: str
+    prompt: str
+
+
+def load_campaign(path: Path) -> tuple[Campaign, list[PlannedTest]]:
+    """Read and check a campaign file and every scene in it.
+
+    Raises
+    ------
+    FileError
+        Names the file, the key, the value and the allowed range.
+    """
+    text = read_text(path, "campaign")
+    try:
+        campaign = Campaign.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"campaign {path}: not valid TOML: {error}. Remedy: mend the line it names.") from error
+    except ValidationError as error:
+        raise FileError(explain("campaign", str(path), error, Campaign)) from error
+    return campaign, list(_ordered(campaign, list(_tests(campaign, path.parent))))
+
+
+def single(scene: Scene, text: str, stem: str, repeats: int, seed: int) -> list[PlannedTest]:
+    """Return the tests of one scene: its places, each so often."""
+    return list(_places(scene, text, stem, repeats, seed, ""))
+
+
+def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
+    for number, section in enumerate(campaign.test):
+        beside = folder / section.scene
+        text, source = find_scene(str(beside) if beside.suffix and beside.exists() else section.scene)
+        scene = parse_scene(text, source)
+        repeats = section.repeats or campaign.repeats
+        for pressure in section.initial_pressures_kPa or (None,):
+            stem = f"{number + 1:02d}-{Path(source).stem}"
+            if pressure is None:
+                yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt)
+                continue
+            stem += f"-{pressure:+g}kPa"
+            changed, changed_text = _at_pressure(text, pressure, f"{source} at {pressure:g} kPa")
+            yield from _places(changed, changed_text, stem, repeats, campaign.seed, section.prompt)
+
+
+def _at_pressure(text: str, pressure: float, source: str) -> tuple[Scene, str]:
+    content: dict[str, Any] = tomllib.loads(text)
+    content.setdefault("protocol", {})["initial_pressure_kPa"] = pressure
+    lines = [line for line in text.splitlines() if not line.startswith("initial_pressure_kPa")]
+    place = next((i for i, line in enumerate(lines) if line.strip() == "[protocol]"), None)
+    if place is None:
+        lines += ["", "[protocol]", 'name = "pull_off"']
+        place = len(lines) - 2
+    lines.insert(place + 1, f"initial_pressure_kPa = {pressure!r}")
+    return validate_scene(content, source), "\n".join(lines) + "\n"
+
+
+def _places(scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str) -> Iterator[PlannedTest]:
+    places: Sequence[str] = getattr(scene.protocol, "positions", ("",))
+    repeats = max(repeats, getattr(scene.protocol, "repeats", 1))
+    for index, place in enumerate(places):
+        hands = prompt if not place else " ".join(filter(None, (prompt, f"Bring the probe over {place}.")))
+        for repeat in range(1, repeats + 1):
+            parts = [stem, _word(place), f"{repeat}" if repeats > 1 else ""]
+            key = "-".join(filter(None, parts))
+            yield PlannedTest(
+                key=key,
+                scene=scene,
+                scene_text=text,
+                place=place,
+                repeat=repeat,
+                repeats=repeats,
+                seed=seed + 1000 * index + repeat - 1,
+                setup=f"{stem.split('-', maxsplit=1)[0]} {place}",
+                prompt=hands,
+            )
+
+
+def _word(place: str) -> str:
+    return "".join(letter if letter.isalnum() else "_" for letter in place)
+
+
+def _ordered(campaign: Campaign, tests: list[PlannedTest]) -> Iterator[PlannedTest]:
+    """Yield the tests; ``random`` shuffles within each setup, since a change of setup needs hands."""
+    if campaign.order == "given":
+        yield from tests
+        return
+    shuffled = random.Random(campaign.seed)
+    for setup in dict.fromkeys(test.setup for test in tests):
+        group = [test for test in tests if test.setup == setup]
+        shuffled.shuffle(group)
+        yield from group
+
+
+@dataclass
+class Journal:
+    """What of a campaign is done, on disk in its folder."""
+
+    folder: Path
+
+    def done(self) -> dict[str, str]:
+        """Return the recordings of the finished tests by key; a torn last line counts as unwritten.
+
+        Raises
+        ------
+        FileError
+            A line in the middle of the journal is no entry.
+        """
+        path = self.folder / JOURNAL
+        if not path.exists():
+            return {}
+        entries: dict[str, str] = {}
+        lines = path.read_text(encoding="utf-8").split("\n")
+        for number, line in enumerate(lines, 1):
+            if not line:
+                continue
+            try:
+                entry = json.loads(line)
+                entries[str(entry["key"])] = str(entry["recording"])
+            except (ValueError, KeyError, TypeError) as error:
+                if number == len(lines):
+                    continue  # the program died while writing it
+                raise FileError(f"{path}, line {number}: no entry ({error}). Remedy: remove that line.") from error
+        return entries
+
+    def write(self, key: str, recording: str, **more: Any) -> None:
+        """Append one finished test and sync it to the disk."""
+        self._mend()
+        with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"key": key, "recording": recording, **more}) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def adopt(self, tests: Sequence[PlannedTest], is_whole: Callable[[Path], bool]) -> list[str]:
+        """Enter tests whose recording is whole although the journal does not know them; return their keys."""
+        done, adopted = self.done(), []
+        for test in tests:
+            if test.key in done:
+                continue
+            for recording in sorted(self.folder.glob(f"{test.key}*.h5")):
+                if self._belongs(recording, test.key) and is_whole(recording):
+                    self.write(test.key, recording.name, adopted=True)
+                    adopted.append(test.key)
+                    break
+        return adopted
+
+    def free_name(self, key: str) -> Path:
+        """Return a name for the test's recording that nothing has yet."""
+        for number in range(1, 10_000):
+            path = self.folder / (f"{key}.h5" if number == 1 else f"{key}~{number}.h5")
+            if not path.exists():
+                return path
+        raise FileError(f"{self.folder}: ten thousand recordings of {key}. Remedy: clear the folder.")
+
+    @staticmethod
+    def _belongs(recording: Path, key: str) -> bool:
+        return recording.stem.partition("~")[0] == key
+
+    def _mend(self) -> None:
+        """Cut a torn last line off."""
+        path = self.folder / JOURNAL
+        if not path.exists():
+            return
+        content = path.read_bytes()
+        if content and not content.endswith(b"\n"):
+            path.write_bytes(content[: content.rfind(b"\n") + 1])

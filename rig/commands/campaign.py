@@ -1,0 +1,137 @@
+"""``rig campaign``: run a matrix of scenes, resumable."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rig.bench import Bench
+    from rig.campaign import Journal
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("file", type=Path, help="campaign file")
+    parser.add_argument("--bench", type=Path, help="bench file; without one everything is emulated")
+    parser.add_argument("--out", type=Path, help="folder of the recordings (default: recordings/<campaign>)")
+    parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
+    parser.add_argument("--jobs", type=int, default=1, help="emulated bench: tests at the same time")
+    parser.add_argument("--yes", action="store_true", help="do not wait for the operator's hands")
+    parser.add_argument("--report", type=Path, metavar="HTML", help="analyse the whole campaign into one page")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run what is not yet done; return the first failure's exit code."""
+    import sys
+
+    from tqdm import tqdm
+
+    from rig.bench import load_bench
+    from rig.campaign import Journal, load_campaign
+    from rig.check import check
+    from rig.errors import FileError
+
+    campaign, tests = load_campaign(arguments.file)
+    bench, bench_text = load_bench(arguments.bench)
+    if arguments.jobs > 1 and not bench.is_emulated:
+        raise FileError("--jobs: a real rig runs one test at a time. Remedy: leave it out.")
+    for scene in {test.scene_text: test.scene for test in tests}.values():
+        check(scene, bench)
+    folder = arguments.out or Path("recordings") / arguments.file.stem
+    folder.mkdir(parents=True, exist_ok=True)
+    journal = Journal(folder)
+    adopted = journal.adopt(tests, _is_whole)
+    done = journal.done()
+    todo = [test for test in tests if test.key not in done]
+    found = f", {len(adopted)} of them found whole without an entry" if adopted else ""
+    print(f"{campaign.title}: {len(tests)} tests, {len(tests) - len(todo)} done{found}", file=sys.stderr)
+    hands = not arguments.yes and not bench.is_emulated
+    with tqdm(total=len(todo), unit="test", disable=not sys.stderr.isatty()) as bar:
+        for code in _run_all(todo, bench, bench_text, journal, arguments, hands):
+            bar.update()
+            if code:
+                return code
+    if arguments.report is not None:
+        from rig.cli import main
+
+        entries = journal.done()
+        files = [str(folder / entries[test.key]) for test in tests]
+        return main(["analyze", *files, "--report", str(arguments.report)])
+    return 0
+
+
+def _run_all(
+    tests: list[PlannedTest],
+    bench: Bench,
+    bench_text: str,
+    journal: Journal,
+    arguments: argparse.Namespace,
+    hands: bool,
+) -> Iterator[int]:
+    """Run the tests one after another, or on the emulated bench several at once; yield exit codes as they come."""
+    if arguments.jobs <= 1:
+        setup = None
+        for test in tests:
+            if hands and test.prompt and test.setup != setup:
+                input(f"{test.prompt} Press Enter to go on. ")
+            setup = test.setup
+            yield _enter(
+                journal, test, *_run_one(test, bench, bench_text, journal.free_name(test.key), arguments.direct)
+            )
+        return
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        futures = {
+            pool.submit(_run_one, test, bench, bench_text, journal.free_name(test.key), arguments.direct): test
+            for test in tests
+        }
+        for future in as_completed(futures):
+            yield _enter(journal, futures[future], *future.result())
+
+
+def _run_one(test: PlannedTest, bench: Bench, bench_text: str, out: Path, direct: bool) -> tuple[str, int, str]:
+    from rig.session import Request, run_scene
+
+    request = Request(
+        scene=test.scene,
+        scene_text=test.scene_text,
+        bench=bench,
+        bench_text=bench_text,
+        out=out,
+        seed=test.seed,
+        wire=not direct,
+        live=False,
+        repeat=test.repeat,
+        repeats=test.repeats,
+        place=test.place,
+    )
+    ending = run_scene(request)
+    return out.name, ending.exit_code, ending.reason
+
+
+def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reason: str) -> int:
+    """Enter a test that has succeeded; say why one has not."""
+    import sys
+
+    if code:
+        print(f"rig campaign: {test.key}: {reason}", file=sys.stderr)
+    else:
+        journal.write(test.key, recording)
+    return code
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the recording came to its end; one left by a crash is repaired and kept, but is not whole."""
+    from rig.errors import FileError
+    from rig.recording import load_recording
+
+    try:
+        ending = load_recording(path).ending
+    except FileError:
+        return False
+    return ending is not None and ending[1] == 0
