@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.live_data import Evidence
+from rig.live_data import TOUCH_N, Evidence
 
 if TYPE_CHECKING:
     from model import Parameters
@@ -33,7 +33,9 @@ UPDATES = 40
 NINETY = 1.6449
 """Half the width of a normal 90 % interval, in standard deviations."""
 SURPRISE = 4.0
-"""Data have left the band when they lie so many standard deviations from the announced curve, twice running."""
+"""Data have left the band when they lie so many standard deviations from the announced curve."""
+STAYS = 4
+"""Predictions for which that is said: the fit soon follows the data, the operator should still see it."""
 PASSED = 0.99
 """F_p has been reached once the tension is down to this part of its peak: the model's curves have a single one."""
 LEAST_WAY = 0.03
@@ -156,7 +158,7 @@ class LivePredictor:
         self._nominal_work = parameters.membrane.work_of_adhesion
         self._values: Mapping[str, float] | None = None
         self._last: LivePrediction | None = None
-        self._surprises = 0
+        self._surprised = 0
         self._note = ""
         random = np.random.default_rng(20)
         self._values_drawn = random.standard_normal((DRAWS, 5))
@@ -205,16 +207,17 @@ class LivePredictor:
     @property
     def verdict(self) -> tuple[bool, str]:
         """Whether the data are inside the band, and what to say if not."""
-        return self._surprises < 2, self._note if self._surprises >= 2 else ""
+        return self._surprised == 0, self._note if self._surprised else ""
 
     def _compare(self, evidence: Evidence) -> None:
         """Hold what has come since the last announcement against it."""
         last = self._last
         if last is None:
             return
-        new = evidence.height - last.zero_height > last.progress * last.pull_off_distance.value
-        if new.sum() < 2:
+        new = np.flatnonzero(evidence.height - last.zero_height > last.progress * last.pull_off_distance.value)
+        if new.size < 2:
             return
+        new = new[-max(2, new.size // 3) :]
         place = evidence.height[new] - last.zero_height
         force = float((evidence.force[new] - last.force_zero.value).mean())
         if place.mean() > last.pull_off_distance.low:
@@ -223,9 +226,9 @@ class LivePredictor:
         high = float(np.interp(place, last.retraction, last.force_high).mean())
         sigma = (high - low) / 2 / NINETY + evidence.force_noise
         if abs(force - (low + high) / 2) <= SURPRISE * sigma:
-            self._surprises = 0
+            self._surprised = max(0, self._surprised - 1)
             return
-        self._surprises += 1
+        self._surprised = STAYS
         self._note = (
             f"F_r left the band at z_r = {place.mean() * 1e3:.3f} mm: "
             f"{force:.3f} N measured, {low:.3f} to {high:.3f} N announced"
@@ -382,9 +385,10 @@ class _Announcement:
 
     def _pull_off_force(self) -> Estimate:
         """The peak: what has been reached, or what is still to come."""
-        reached = float(self._tension.max()) if self._tension.size else 0.0
+        reached = max(float(self._tension.max()), 0.0) if self._tension.size else 0.0
         sigma = self._sigma("force_zero")
-        passed = self._tension.size and self._tension[-1] < PASSED * reached - 5 * self._evidence.force_noise
+        least = PASSED * reached - 5 * self._evidence.force_noise
+        passed = reached > 20 * TOUCH_N and self._tension[-1] < least
         if passed or self._curves.end <= self._now:
             return Estimate(reached, reached - NINETY * sigma, reached + NINETY * sigma)
         place = np.linspace(self._now, self._curves.end, POINTS)

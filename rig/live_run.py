@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import Protocol
 
 from model.parameters import Parameters
@@ -20,6 +21,9 @@ from rig.live import UPDATES, LivePrediction, LivePredictor
 from rig.live_data import Gathering, Glance
 from rig.observe import Ending, StepEvent, StepPhase, Watcher
 from sequences.frame import Frame
+
+MOST_WAITING = 50_000
+"""Frames the process may be behind before it is given up."""
 
 Tell = Callable[[LivePrediction, str], None]
 """Takes a prediction and the form of it that a recording keeps."""
@@ -156,7 +160,8 @@ class Again:
 class Beside:
     """Makes predictions in a process of its own, of whatever has come when the last one is ready.
 
-    Each frame costs the caller one small write; the process empties its pipe at all times, so the write never waits.
+    A frame costs the caller one entry in a queue. A thread writes the queue to the process: should that be frozen, the
+    thread waits, not the loop.
     """
 
     def __init__(self, parameters: Parameters, compliance: float) -> None:
@@ -167,43 +172,47 @@ class Beside:
         )
         self._process.start()
         theirs.close()
-        self._lost = False
-
-    @property
-    def lost(self) -> bool:
-        """Whether the process has died; the run goes on without predictions."""
-        return self._lost
+        self._queue: SimpleQueue[object] = SimpleQueue()
+        self._feeder = threading.Thread(target=self._feed, daemon=True, name="live prediction feed")
+        self._feeder.start()
+        self.lost = False
+        """Whether the process has died or is hopelessly behind; the run goes on without predictions."""
 
     def step(self, event: StepEvent) -> None:
         """See ``Maker``."""
-        self._send({"step": event.name, "sample": event.sample})
+        self._put({"step": event.name, "sample": event.sample})
 
     def frame(self, glance: Glance) -> LivePrediction | None:
         """See ``Maker``."""
-        self._send({"frame": glance})
+        self._put({"frame": glance})
         try:
-            if self._lost or not self._pipe.poll():
+            if self.lost or not self._pipe.poll():
                 return None
             return LivePrediction.from_json(self._pipe.recv_bytes().decode())
         except (EOFError, OSError):
-            self._lost = True
+            self.lost = True
             return None
 
-    def _send(self, message: object) -> None:
-        if self._lost:
-            return
+    def _put(self, message: object) -> None:
+        if self._queue.qsize() > MOST_WAITING:
+            self.lost = True
+        if not self.lost:
+            self._queue.put(message)
+
+    def _feed(self) -> None:
         try:
-            self._pipe.send_bytes(json.dumps(message).encode())
+            while (message := self._queue.get()) is not None:
+                self._pipe.send_bytes(json.dumps(message).encode())
         except OSError:
-            self._lost = True
+            self.lost = True
 
     def close(self) -> None:
         """See ``Maker``."""
+        self._queue.put(None)
+        self._process.kill()  # it holds nothing, and may be frozen
+        self._process.join()
+        self._feeder.join()
         self._pipe.close()
-        self._process.join(2.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
         self._process.close()
 
 

@@ -43,9 +43,19 @@ def _png(plot: Plot, path: Path) -> None:
 
 
 def _svg(plot: Plot, path: Path) -> None:
-    from pyqtgraph.exporters import SVGExporter
+    from PySide6.QtCore import QRect
+    from PySide6.QtGui import QPainter
+    from PySide6.QtSvg import QSvgGenerator
 
-    SVGExporter(plot.item).export(str(path))
+    size = plot.view.size()
+    drawing = QSvgGenerator()
+    drawing.setFileName(str(path))
+    drawing.setSize(size)
+    drawing.setViewBox(QRect(0, 0, size.width(), size.height()))
+    drawing.setTitle(f"{plot.y.name} against {plot.x.name}")
+    painter = QPainter(drawing)
+    plot.view.render(painter)
+    painter.end()
 
 
 def _csv(plot: Plot, path: Path) -> None:
