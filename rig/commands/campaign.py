@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rig.bench import Bench
-    from rig.campaign import Journal
+    from rig.campaign import Journal, PlannedTest
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

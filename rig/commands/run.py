@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rig.campaign import PlannedTest
     from rig.observe import Ending
     from rig.session import Request
 
