@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import NotConverged
-from model.membrane_branch import Counter, Line, pinned_state, release_branch
+from model.membrane_branch import Counter, Line, near_branch, pinned_state, release_branch
 from model.membrane_contact import Contact, ContactStretch, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
 from model.membrane_equilibrium import solve as solve_states
-from model.membrane_path import Features, Piece, Place, Resolution, features, path, peel_panels, pinned_panels
+from model.membrane_path import Features, Memory, Piece, Place, Resolution, features, path, peel_panels, pinned_panels
 from model.parameters import GasAnchor, Parameters
 from model.prediction import Jump, Outcome, Prediction
 from model.start import check, start_position, start_radius
@@ -73,6 +73,7 @@ def solve(
     contact_stretch: ContactStretch | str = ContactStretch.EML,
     tension_field: bool = False,
     tolerance: float = 1e-8,
+    memory: Memory | None = None,
 ) -> Prediction:
     """Predict one pull-off test with the membrane in exact equilibrium.
 
@@ -88,6 +89,8 @@ def solve(
         Whether the hoop direction wrinkles instead of carrying compression.
     tolerance
         Relative error aimed at in F_p and D_p.
+    memory
+        Keeps what the next call with nearby parameters can start from: pass the same object to every call.
 
     Raises
     ------
@@ -115,7 +118,9 @@ def solve(
         if isinstance(anchored, Outcome):
             prediction = replace(prediction, outcome=anchored)
         else:
-            prediction = _solve(replace(scaled, annulus=anchored), prediction, points, tolerance, counter)
+            prediction = _solve(
+                replace(scaled, annulus=anchored), prediction, points, tolerance, counter, memory or Memory()
+            )
     return replace(prediction, runtime_s=time.perf_counter() - began, evaluations={"membrane states": counter.states})
 
 
@@ -181,11 +186,19 @@ def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Co
     return replace(annulus, gas=replace(gas, volume=gas.free_volume + change))
 
 
-def _solve(scaled: Scene, empty: Prediction, points: int, tolerance: float, counter: Counter) -> Prediction:
-    branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter)
+def _solve(
+    scaled: Scene, empty: Prediction, points: int, tolerance: float, counter: Counter, memory: Memory
+) -> Prediction:
+    known, memory.branch = memory.branch, None
+    branch = None
+    if known is not None and known.coordinate[0] == scaled.width:
+        branch = near_branch(scaled.annulus, known, counter)
+    if branch is None:
+        branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter)
     if branch is None or not _rises_above_start(scaled, branch):
         return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
-    found = _refined(scaled, branch, tolerance, counter)
+    memory.branch = branch
+    found = _refined(scaled, branch, tolerance, counter, memory)
     if found.features.peak.pull <= 0:
         return replace(empty, outcome=Outcome.NO_ADHESION)
     return _prediction(scaled, found, empty, points)
@@ -196,14 +209,16 @@ def _rises_above_start(scaled: Scene, branch: Line) -> bool:
     return bool((heights > scaled.start).any())
 
 
-def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter) -> Found:
+def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter, memory: Memory) -> Found:
     """Raise the order of the shape until the features stand still."""
     relative = math.inf
     for order in ORDERS:
         resolution = Resolution(order, 0.1 * tolerance)
         peel = peel_panels(scaled.annulus, branch, scaled.start, resolution, counter)
         begins_pinned = peel[0].coordinate[0] == scaled.width
-        pinned = pinned_panels(scaled.annulus, peel[0], scaled.start, resolution, counter) if begins_pinned else []
+        pinned = []
+        if begins_pinned:
+            pinned = pinned_panels(scaled.annulus, peel[0], scaled.start, resolution, counter, memory)
         pieces = path(peel, pinned, scaled.start)
         read = features(pieces, scaled.start)
         errors = _errors(scaled, read, counter)

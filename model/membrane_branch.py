@@ -23,6 +23,8 @@ COARSE_ORDER = 10
 SMALLEST_CONTACT = 3.9
 """Width ln(R_0 / a) to which a branch is followed at first, a = 0.02 R_0."""
 LAST_WIDTH = 14.0
+STARTS = np.array([0.0, 0.25, 0.7, 1.4, 2.4])
+"""Widths, beyond the widest contact's, at which a branch is looked for."""
 NARROW_STRIP = 0.05
 """Width at which the closed form of the strip starts every solution."""
 FOLD_SLOPE = 0.25
@@ -124,11 +126,11 @@ def _raise_load(annulus: Annulus, width: float, closure: Closure, height: float,
         return _accepted(_at_fraction(annulus, fraction), widths, guess, closure, target, counter)
 
     line = follow(solve_at, 0.0, rest, 1.0, step=0.5, smallest=1e-11)
-    if line.coordinate[-1] == 1.0:
-        return Start(line.state[-1:], turned=False)
     first, last = (
         release_slope(_at_fraction(annulus, float(line.coordinate[i])), widths, line.state[[i]])[0] for i in (0, -1)
     )
+    if line.coordinate[-1] == 1.0 and (last > 0 or closure is Closure.HEIGHT):
+        return Start(line.state[-1:], turned=False)
     return Start(None, turned=_turned(line, widths) or bool(last < FOLD_SLOPE * first))
 
 
@@ -204,8 +206,6 @@ def _accepted(
         return None
     if relative_size(solved.state, solved.state - guess, widths)[0] > surprise:
         return None
-    if closure is Closure.RELEASE and not release_slope(annulus, widths, solved.state)[0] > 0:
-        return None  # a lower root: z_eq is the largest
     return solved.state
 
 
@@ -221,17 +221,18 @@ def release_branch(annulus: Annulus, width: float, height: float, counter: Count
     NotConverged
         No state was found, and nothing says that there is none.
     """
-    starts = width + np.array([0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6])
     turned = False
-    for start in map(float, starts):
+    for start in map(float, width + STARTS):
         found = release_state(annulus, start, counter)
         if found.state is not None:
             return _both_ways(annulus, start, found.state, width, counter)
         turned = turned or found.turned
-    for start in map(float, starts[::2]):
+    if turned:
+        return None
+    for start in map(float, width + STARTS):
         pinned = pinned_state(annulus, start, height, counter)
-        turned = turned or pinned.turned
         if pinned.state is None:
+            turned = turned or pinned.turned
             continue
         state, peels = _lift_until_release(annulus, start, pinned.state, height, counter)
         if state is not None:
@@ -240,6 +241,17 @@ def release_branch(annulus: Annulus, width: float, height: float, counter: Count
     if not turned:
         raise NotConverged("membrane: no peeling state could be solved; the scene is too extreme for the solver")
     return None
+
+
+def near_branch(annulus: Annulus, known: Line, counter: Counter) -> Line | None:
+    """Return the branch of a scene next to one whose branch is known, all its states at once; ``None`` if too far."""
+    solved = counter.note(solve(annulus, known.coordinate, known.state, iterations=6))
+    if not solved.converged.all():
+        return None
+    line = Line(known.coordinate, solved.state)
+    if _still_rising(annulus, line) or (release_slope(annulus, line.coordinate, line.state) <= 0).any():
+        return None
+    return line
 
 
 def _lift_until_release(
@@ -269,7 +281,15 @@ def _both_ways(annulus: Annulus, start: float, state: Array, width: float, count
         if further.coordinate.size == 1:
             break
         line = _join(line, further)
-    return line
+    return _upper(annulus, line, start)
+
+
+def _upper(annulus: Annulus, line: Line, start: float) -> Line:
+    """Return the part of a line around ``start`` on which z_eq is the upper root."""
+    lower = np.flatnonzero(release_slope(annulus, line.coordinate, line.state) <= 0)
+    low = max((int(i) + 1 for i in lower if line.coordinate[i] < start), default=0)
+    high = min((int(i) for i in lower if line.coordinate[i] > start), default=line.coordinate.size)
+    return Line(line.coordinate[low:high], line.state[low:high])
 
 
 def _join(first: Line, second: Line) -> Line:
@@ -283,9 +303,21 @@ def _still_rising(annulus: Annulus, line: Line) -> bool:
     return bool(height[-1] >= height.max())
 
 
-def pinned_line(annulus: Annulus, width: float, state: Array, top: float, bottom: float, counter: Counter) -> Line:
-    """Return the pinned states from the rim height ``top`` of a known state down (or up) to ``bottom``."""
+def pinned_line(
+    annulus: Annulus, width: float, state: Array, top: float, bottom: float, counter: Counter, known: Line | None = None
+) -> Line:
+    """Return the pinned states from the rim height ``top`` of a known state down (or up) to ``bottom``.
+
+    ``known`` is such a line of a neighbouring scene: then all states are tried at once first.
+    """
     widths = np.array([width])
+    if known is not None and known.coordinate.size > 1:
+        low, high = known.coordinate[[0, -1]]
+        heights = bottom + (top - bottom) * (known.coordinate - low) / (high - low)
+        tried = np.full(heights.size, width)
+        solved = solve(annulus, tried, known.state, closure=Closure.HEIGHT, target=heights, iterations=6)
+        if counter.note(solved).converged.all():
+            return Line(heights, solved.state)
 
     def solve_at(height: float, guess: Array) -> Array | None:
         return _accepted(annulus, widths, guess, Closure.HEIGHT, height, counter)

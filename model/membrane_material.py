@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+LAST_STEP = 1e-8
+"""Relative step after which the quadratic convergence of the stretch is at rounding."""
+
 
 class Response(NamedTuple):
     """State of the membrane at given meridional tension and hoop stretch.
@@ -73,14 +76,17 @@ def _wrinkled(tension: Array, taut: Response) -> Response:
 
 
 def _larger_root(tension: Array, constant: Array, *, power: int) -> Array:
-    """Solve x^(n-1) (x - tension) = constant by Newton's method from above, where the left side is convex."""
-    root = tension + constant ** (1 / power)
+    """Solve x^(n-1) (x - tension) = constant for its largest root by Newton's method.
+
+    The start is the series in small tension, bounded by tension + constant^(1/n) above the root: there the left side
+    is convex and the iteration cannot leave it.
+    """
+    base = constant ** (1 / power)
+    root = np.minimum(base + tension / power * (1 + (power - 1) / (2 * power) * tension / base), base + tension)
     for _ in range(50):
         lower = root ** (power - 2)
-        value = lower * root * (root - tension) - constant
-        slope = lower * (power * root - (power - 1) * tension)
-        step = value / slope
+        step = (lower * root * (root - tension) - constant) / (lower * (power * root - (power - 1) * tension))
         root = root - step
-        if np.all(np.abs(step) <= 1e-13 * root):  # quadratic: the next step would be below rounding
+        if not (np.abs(step) > LAST_STEP * root).any():
             break
     return root

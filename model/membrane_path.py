@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -98,6 +99,14 @@ class Features(NamedTuple):
         return self.detachment.height - self.start.height
 
 
+@dataclass(slots=True)
+class Memory:
+    """The coarse lines of the last scene, from which a neighbouring one is reached at once."""
+
+    branch: Line | None = None
+    pinned: Line | None = None
+
+
 class Resolution(NamedTuple):
     """How well a line is to be resolved: order of the shapes, relative size of the last terms of the series."""
 
@@ -114,7 +123,9 @@ def peel_panels(annulus: Annulus, branch: Line, floor: float, resolution: Resolu
     return _panels(annulus, branch, ends, None, resolution, counter, DEEPEST)
 
 
-def pinned_panels(annulus: Annulus, peel: Panel, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
+def pinned_panels(
+    annulus: Annulus, peel: Panel, floor: float, resolution: Resolution, counter: Counter, memory: Memory
+) -> list[Panel]:
     """Return the states at the widest contact from ``floor`` up to where it peels; none if it peels at once.
 
     Where the membrane goes slack on the way, its states are followed from both ends and a gap stays between.
@@ -122,9 +133,10 @@ def pinned_panels(annulus: Annulus, peel: Panel, floor: float, resolution: Resol
     width, top = float(peel.coordinate[0]), float(peel.height(peel.coordinate[0]))
     if top - floor <= 1e-12 * (1 + abs(floor)):
         return []
-    upper = pinned_line(annulus, width, peel.state[:1], top, floor, counter)
+    upper = pinned_line(annulus, width, peel.state[:1], top, floor, counter, memory.pinned)
     lines = [upper]
     reached = float(upper.coordinate[0])
+    memory.pinned = upper if reached == floor else None
     if reached > floor:
         bottom = pinned_state(annulus, width, floor, counter).state
         if bottom is not None:
