@@ -27,6 +27,9 @@ class Segment(NamedTuple):
         return self.position + 0.5 * (self.velocity + velocity) * elapsed, velocity
 
 
+NOWHERE = 1e-15
+"""A shorter way is none, m."""
+
 Trajectory = tuple[Segment, ...]
 """Segments in order of time; the last one is rest."""
 
@@ -67,7 +70,7 @@ def trapezoid(
         first = brake(time, position, velocity, deceleration)
         end = first[-1]
         return first[:-1] + trapezoid(end.start, end.position, 0.0, target, speed, acceleration, deceleration)
-    if distance == 0.0:
+    if distance < NOWHERE:
         return rest(time, target)
     if forward > speed:
         top, ramp = speed, -deceleration
