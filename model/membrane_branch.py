@@ -183,11 +183,12 @@ def _at_fraction(annulus: Annulus, fraction: float) -> Annulus:
         return annulus
     gas = annulus.gas
     measured = None if gas.measured is None else (gas.measured[0], fraction * gas.measured[1])
-    looser = np.inf if fraction == 0.0 else 1 / fraction
-    free = gas.free_volume if fraction == 0.0 else gas.free_volume * looser
-    eased = replace(
-        gas, pressure=gas.pressure * fraction, volume=gas.volume * looser, free_volume=free, measured=measured
-    )
+    eased = replace(gas, pressure=gas.pressure * fraction, measured=measured)
+    if fraction == 0.0:
+        eased = replace(eased, volume=np.inf)
+    elif np.isfinite(gas.volume):  # V / V_start = 1 + fraction times what it is in the whole scene
+        volume = gas.volume / fraction
+        eased = replace(eased, volume=volume, free_volume=volume + gas.free_volume - gas.volume)
     return replace(annulus, surface=Surface(annulus.surface.curvature * fraction), gas=eased)
 
 

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 PANEL_SIZES = (16, 32)
 """Points of a panel, less one. A panel that the larger number does not resolve is halved."""
+SHORTEST = 1e-9
+"""Rise of a pinned part, relative to the heights it lies between, below which it is left out."""
 DEEPEST = 12
 """How often a panel may be halved: near slack states height and force turn within a narrow range."""
 
@@ -131,7 +133,7 @@ def pinned_panels(
     Where the membrane goes slack on the way, its states are followed from both ends and a gap stays between.
     """
     width, top = float(peel.coordinate[0]), float(peel.height(peel.coordinate[0]))
-    if top - floor <= 1e-12 * (1 + abs(floor)):
+    if top - floor <= SHORTEST * (1 + abs(floor)):
         return []
     upper = pinned_line(annulus, width, peel.state[:1], top, floor, counter, memory.pinned)
     lines = [upper]
