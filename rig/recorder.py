@@ -6,7 +6,12 @@ program. Layout: ``docs/recording.md``.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import re
+import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -26,6 +31,8 @@ from sequences.frame import Frame
 
 FORMAT = "membrane-adhesion-rig recording 1"
 FLUSH_SECONDS = 0.05
+LEAST_ROOM = 16 << 20
+"""Free bytes on the disk at which a run ends: enough to finish and close the recording."""
 
 FRAMES = np.dtype([("start", "<i8"), ("samples", "<i4"), ("arrived_s", "<f8")])
 STAGE = np.dtype(
@@ -76,6 +83,8 @@ def unpack_pump(row: Any) -> PumpStatus:
 class Recorder:
     """Writes one recording.
 
+    ``acknowledged`` counts the samples that have been flushed; ``failed`` is set when the disk has refused a write.
+
     Parameters
     ----------
     path
@@ -96,6 +105,7 @@ class Recorder:
     ) -> None:
         self.path = path
         self.acknowledged = 0
+        self.failed = False
         self._pending: dict[str, list[NDArray[Any]]] = {}
         self._frames: list[tuple[Frame, NDArray[np.float64], float]] = []
         self._last_flush = time.perf_counter()
@@ -106,6 +116,7 @@ class Recorder:
         except (OSError, ValueError) as error:
             remedy = "choose another name with --out" if path.exists() else "check the folder, its rights and its space"
             raise FileError(f"recording {path}: cannot be created ({error}). Remedy: {remedy}.") from error
+        self._held = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         self._sets = self._layout(info, channels, metadata, units)
         self._file.flush()
         self._file.swmr_mode = True
@@ -153,6 +164,7 @@ class Recorder:
         self._frames.append((frame, height, arrived))
         if time.perf_counter() - self._last_flush >= FLUSH_SECONDS:
             self.flush()
+            self._insist_on_disk()
 
     def step(self, event: StepEvent) -> None:
         """Take the beginning or the end of a step."""
@@ -188,16 +200,11 @@ class Recorder:
         FileError
             The disk is full or gone; what was acknowledged before stays readable.
         """
-        try:
+        with self._detached_on_failure():
             for name, blocks in self._pending.items():
                 _extend(self._sets[name], np.concatenate(blocks))
             if self._frames:
                 self._write_frames([frame for frame, _, _ in self._frames])
-        except (OSError, RuntimeError) as error:
-            raise FileError(
-                f"recording {self.path}: writing failed after {self.acknowledged} samples ({error}). "
-                "Remedy: free space on the disk; what was written stays readable."
-            ) from error
         if self._frames:
             self.acknowledged = self._frames[-1][0].stop
         self._pending.clear()
@@ -229,17 +236,79 @@ class Recorder:
                 yield frame.stop, pump.sent, pump.received, state, pump.rate, pump.volume
 
     def close(self) -> None:
-        """Flush and close; a closed recorder closes again without effect."""
+        """Flush, close and seal; a closed recorder, or one whose disk has failed, closes without effect."""
         if not self._file:
             return
+        self.flush()
+        with self._detached_on_failure():
+            self._file.flush()
         try:
-            self.flush()
-        finally:
             self._file.close()
-        seal(self.path)
+            seal(self._rescued())
+        finally:
+            os.close(self._held)
+
+    def _insist_on_disk(self) -> None:
+        """End the run in good order before the disk is full, or when the file has gone from its place."""
+        if not self._in_place():
+            raise FileError(
+                f"recording {self.path}: the file has been removed or moved while it was written. Remedy: leave it in "
+                "its place; it is written there again now that the run has ended."
+            )
+        room = shutil.disk_usage(self.path.parent).free
+        if room < LEAST_ROOM:
+            raise FileError(
+                f"recording {self.path}: only {room >> 20} MiB are left on the disk. "
+                "Remedy: free space, or choose another disk with --out; the recording is complete so far."
+            )
+
+    def _in_place(self) -> bool:
+        with contextlib.suppress(FileNotFoundError):
+            return os.path.samestat(os.fstat(self._held), self.path.stat())
+        return False
+
+    def _rescued(self) -> Path:
+        """Return where the closed file lies; one that was removed is written again from the handle we kept."""
+        if self._in_place():
+            return self.path
+        taken = self.path.exists()
+        path = self.path.with_name(f"{self.path.stem}-rescued{self.path.suffix}") if taken else self.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(self._held, "rb", closefd=False) as held, path.open("xb") as written:
+            held.seek(0)
+            shutil.copyfileobj(held, written)
+        return path
+
+    @contextlib.contextmanager
+    def _detached_on_failure(self) -> Iterator[None]:
+        """After a failed write let HDF5 write the rest into a scratch file and close that.
+
+        It could not close the file itself: the attempt ends in a crash of the interpreter, at its exit. What an earlier
+        flush has put on the disk stays as it is.
+        """
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            self.failed = True
+            with tempfile.TemporaryFile(dir=_scratch()) as scratch:
+                os.dup2(scratch.fileno(), self._file.id.get_vfd_handle())
+            self._file.close()
+            os.close(self._held)
+            cause = re.search(r"error message = '([^']*)'", str(error))
+            raise FileError(
+                f"recording {self.path}: writing failed after {self.acknowledged} samples "
+                f"({cause[1] if cause else error}). Remedy: free space on the disk or choose another with --out; "
+                "`rig recover` repairs what was written."
+            ) from error
 
     def _put(self, name: str, block: NDArray[Any]) -> None:
-        self._pending.setdefault(name, []).append(block)
+        if self._file:
+            self._pending.setdefault(name, []).append(block)
+
+
+def _scratch() -> str | None:
+    """Return a directory in memory where there is one: the disk may be full."""
+    return "/dev/shm" if os.path.isdir("/dev/shm") else None
 
 
 def _row(table: np.dtype[Any], *values: Any) -> NDArray[Any]:

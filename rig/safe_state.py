@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from drivers.errors import DeviceError
+
 if TYPE_CHECKING:
     from drivers.interfaces import Daq, Pump, Stage
 
@@ -34,6 +36,7 @@ def _guarded(what: str, action: Callable[[], None], failures: list[str]) -> bool
     try:
         action()
     except Exception as error:  # noqa: BLE001 - whatever a driver raises, the next device must be stopped too
-        failures.append(f"{what} failed: {error}")
+        reason = error.message if isinstance(error, DeviceError) else repr(error)
+        failures.append(f"{what} failed: {reason.rstrip('.')}")
         return False
     return True

@@ -8,8 +8,9 @@ import platform
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -20,13 +21,14 @@ from drivers.errors import DeviceError
 from rig.bench import Bench
 from rig.check import check
 from rig.commanded import CommandedPump, CommandedStage
-from rig.errors import Refused, RigError
+from rig.errors import FileError, Refused, RigError
 from rig.instruments import Opened, open_instruments
 from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
 from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
 from rig.protocols import build_steps
 from rig.recorder import Recorder
+from rig.recording import recover
 from rig.safe_state import make_safe, release
 from rig.scene import Scene
 from sequences.errors import StepFailed
@@ -35,6 +37,9 @@ from sequences.step import Apparatus, Step, play
 
 if TYPE_CHECKING:
     from drivers.emulated.faults import Faults
+
+PROGRAM_ERROR = 70
+"""Exit code of a run that a defect of the program itself has ended."""
 
 _REPORTED = (DeviceError, RigError, StepFailed)
 _LIBRARIES = ("membrane-adhesion-rig", "numpy", "h5py", "pipython", "pyserial", "nidaqmx", "grpcio")
@@ -48,6 +53,8 @@ class Request:
     ----------
     scene_text, bench_text
         The files as they were read; they are kept in the recording.
+    place
+        Position on the membrane, or sample, where a protocol names several.
     seed, speed, wire, faults
         For the emulated bench only: ``speed`` in times real time, ``None`` as fast as possible; ``wire`` false puts
         the instruments straight on the plant.
@@ -67,6 +74,7 @@ class Request:
     controls: Controls = field(default_factory=Controls)
     repeat: int = 1
     repeats: int = 1
+    place: str = ""
 
 
 def run_scene(request: Request) -> Ending:
@@ -80,31 +88,36 @@ def run_scene(request: Request) -> Ending:
     """
     check(request.scene, request.bench)
     opened = open_instruments(request)
-    try:
-        with _signals(request.controls, opened):
+    ending: Ending | None = None
+    with _signals(request.controls, opened):
+        try:
             _make_ready(request, opened)
-            return _recorded(request, opened)
-    finally:
-        _leave(opened)
+            ending = _recorded(request, opened)
+            return ending
+        finally:
+            _leave(opened, ending)
 
 
 def reference_only(request: Request) -> float:
     """Reference the stage, park it, and return where it stands, m. Only on the operator's explicit word."""
     opened = open_instruments(request)
-    try:
-        with _signals(request.controls, opened):
+    with _signals(request.controls, opened):
+        try:
             reference_stage(request, opened)
             return opened.stage.status().position
-    finally:
-        _leave(opened)
+        finally:
+            _leave(opened)
 
 
-def _leave(opened: Opened) -> None:
+def _leave(opened: Opened, ending: Ending | None = None) -> None:
+    """Stop everything once more, close every port, and say what failed unless the ending has said so."""
     failures = make_safe(opened.stage, opened.pump, opened.daq)
     failures += release(opened.stage, opened.pump, opened.daq)
     opened.shut_down()
+    told = "" if ending is None else ending.reason
     for failure in failures:
-        print(f"rig: {failure}. Remedy: switch the device off by hand.", file=sys.stderr)
+        if failure.partition(" failed")[0] not in told:
+            print(f"rig: {failure}. Remedy: switch the device off by hand.", file=sys.stderr)
 
 
 def _recorded(request: Request, opened: Opened) -> Ending:
@@ -151,12 +164,20 @@ def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
         if loop.interlock_latency is not None:
             reporter.event("timing", f"stop sent {loop.interlock_latency * 1e3:.2f} ms after the frame was read")
         return Ending(f"{error}{where}", int(getattr(error, "exit_code", 1)), loop.samples)
+    except Exception as error:  # noqa: BLE001 - a defect of the program must not cost the recording or the stop
+        text = f"the program has failed in step {reporter.step}: {error!r}"
+        reporter.event("fault", f"{text}\n{traceback.format_exc()}")
+        traceback.print_exc()
+        return Ending(f"{text}. Remedy: report it with the recording, which is complete.", PROGRAM_ERROR, loop.samples)
     return Ending("done", 0, loop.samples)
 
 
 def _finish(recorder: Recorder, reporter: Reporter, ending: Ending, failures: list[str], samples: int) -> Ending:
     """Close the recording whatever has happened; a disk that is full must not hide how the run ended."""
-    reason = "; ".join([ending.reason, *failures])
+    reason = ending.reason
+    if failures:
+        remedy = "switch it off by hand." if "Remedy" in reason else "Remedy: switch it off by hand."
+        reason = f"{reason.rstrip('.')}. Besides, {', '.join(failures)}; {remedy}"
     ending = Ending(reason, ending.exit_code if ending.exit_code or not failures else 1, samples)
     try:
         for failure in failures:
@@ -165,7 +186,10 @@ def _finish(recorder: Recorder, reporter: Reporter, ending: Ending, failures: li
         recorder.end(ending)
         recorder.close()
     except (RigError, OSError, RuntimeError) as error:
-        return Ending(f"{ending.reason}; {error}", ending.exit_code or 2, samples)
+        ending = Ending(f"{ending.reason}; {error}", ending.exit_code or 2, samples)
+    if recorder.failed:
+        with suppress(FileError):  # no room for the copy; the ending's message names `rig recover`
+            recover(recorder.path, force=True)
     return ending
 
 
@@ -254,6 +278,7 @@ def _metadata(request: Request) -> dict[str, str]:
         "scene": request.scene_text,
         "bench": request.bench_text,
         "seed": str(request.seed),
+        "place": request.place,
         "versions": json.dumps(
             {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}, sort_keys=True
         ),
@@ -278,8 +303,11 @@ def _signals(controls: Controls, opened: Opened) -> Iterator[None]:
         count += 1
         if count == 1:
             controls.stop()
-        else:
+            return
+        try:
             controls.emergency_stop()
+        except DeviceError as error:  # the loop ends the run at its next frame all the same
+            print(f"rig: {error}", file=sys.stderr)
 
     numbers = [signal.SIGINT, signal.SIGTERM]
     before: dict[signal.Signals, Any] = {number: signal.signal(number, on_signal) for number in numbers}
