@@ -512,10 +512,10 @@ class TcpPort(protocol_socket.Serial):
     """pyserial's TCP port without the 0.3 s it sleeps after closing."""
 
     def close(self) -> None:
-        """Close the connection."""
-        if self.is_open:
-            self.is_open = False
-            self._socket.close()  # type: ignore[attr-defined]
+        """Close the connection, also one that failed while it was being opened."""
+        self.is_open = False
+        if (connection := getattr(self, "_socket", None)) is not None:
+            connection.close()
 
 
 def open_port(connection: str, baud: int, timeout: float) -> serial.SerialBase:
@@ -529,7 +529,14 @@ def open_port(connection: str, baud: int, timeout: float) -> serial.SerialBase:
         The name is malformed.
     """
     if connection.startswith("socket://"):
-        return TcpPort(connection, timeout=timeout, write_timeout=timeout)
+        port = TcpPort(timeout=timeout, write_timeout=timeout)
+        port.port = connection
+        try:
+            port.open()
+        except BaseException:
+            port.close()
+            raise
+        return port
     return serial.Serial(connection, baud, timeout=timeout, write_timeout=timeout, exclusive=True)
 
 
