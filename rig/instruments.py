@@ -93,10 +93,15 @@ def _open_emulated(request: Request) -> Opened:
 
 def _open_direct(request: Request, emulated: EmulatedBench) -> Opened:
     bench, pressure = request.bench, request.scene.uses_pressure
-    daq = emulated.daq(*channel_names(pressure))
+    daq = emulated.daq(*channel_names(pressure), rate=bench.daq.rate_Hz)
+    low, high = bench.stage.minimum_mm * 1e-3, bench.stage.maximum_mm * 1e-3
+    pump = None
+    if pressure and bench.pump is not None:
+        diameter = bench.pump.syringe_diameter_mm * 1e-3
+        pump = emulated.pump(syringe_diameter=diameter, force_percent=bench.pump.force_percent)
     return Opened(
-        emulated.stage(),
-        emulated.pump() if pressure else None,
+        emulated.stage(minimum=low, maximum=high, inverted=bench.stage.inverted),
+        pump,
         daq,
         emulated.clock,
         lambda: sensor_converter(bench, pressure, daq.rate),

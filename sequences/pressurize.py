@@ -1,0 +1,106 @@
+"""Bringing the chamber to a pressure: feed-forward from Boyle's law, then correction."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.interfaces import Pump, PumpState
+from sequences.errors import StepFailed
+from sequences.frame import Frame
+from sequences.step import Apparatus, Steps
+
+SETTLE, MEAN, STROKE = 1.0, 0.5, 4.0
+"""Seconds: rest after a stroke, average, and how long a stroke should take."""
+
+MOST_STROKES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Chamber:
+    """What Boyle's law needs: V_0 (m^3) and P_atm (Pa)."""
+
+    volume: float
+    atmospheric_pressure: float
+
+
+class Pressurizer:
+    """Moves the pump until the pressure is right; the pump is always given a target volume."""
+
+    def __init__(self, apparatus: Apparatus, chamber: Chamber, tolerance: float, step: str) -> None:
+        if apparatus.pump is None:
+            raise StepFailed(step, "the bench has no pump", "add [pump] and [pressure] to the bench")
+        self._pump: Pump = apparatus.pump
+        self._apparatus = apparatus
+        self._chamber = chamber
+        self._tolerance = tolerance
+        self._step = step
+        self._goal = 0.0
+
+    def bring_to(self, goal: float, frame: Frame) -> Steps:
+        """Bring the chamber to ``goal`` (Pa gauge)."""
+        self._goal = goal
+        pressure = np.nan
+        try:
+            for _ in range(MOST_STROKES):
+                frame = yield from self._settle(frame)
+                pressure, frame = yield from self.mean_pressure(frame)
+                if abs(pressure - goal) <= 0.6 * self._tolerance:
+                    self._apparatus.tell.note(f"P_0 reached: {pressure / 1e3:+.3f} kPa")
+                    return frame
+                after = self._chamber.atmospheric_pressure + goal
+                frame = yield from self.dispense(self._chamber.volume * (goal - pressure) / after, frame)
+        finally:
+            self._pump.stop()
+        raise StepFailed(
+            self._step,
+            f"P_a stays at {pressure / 1e3:+.3f} kPa, {goal / 1e3:+g} kPa wanted",
+            "look for a leak, check chamber_volume_ml and the syringe diameter",
+        )
+
+    def dispense(self, volume: float, frame: Frame) -> Steps:
+        """Move the pump by so much (m^3, positive into the chamber) and wait until it has done so."""
+        slowest, fastest = self._pump.rate_limits
+        rate = min(max(abs(volume) / STROKE, 2 * slowest), 0.9 * fastest)
+        before = frame.pump
+        self._pump.dispense(volume, rate)
+        deadline = frame.stop + int((3 * abs(volume) / rate + 5) * frame.rate)
+        while frame.pump is before or frame.pump is None or frame.pump.state in _RUNNING:
+            frame = yield
+            self._show(frame)
+            if frame.stop > deadline:
+                raise StepFailed(self._step, "the pump did not reach its target volume", "look at the pump's screen")
+        if frame.pump.state in (PumpState.STALLED, PumpState.AT_LIMIT):
+            raise StepFailed(
+                self._step,
+                f"the pump is {frame.pump.state} after {frame.pump.volume * 1e6:.4f} ml",
+                "free the syringe, check its travel and the force setting, then run again",
+            )
+        return frame
+
+    def mean_pressure(self, frame: Frame) -> Generator[None, Frame, tuple[float, Frame]]:
+        """Return the mean over half a second, Pa, and the last frame."""
+        means: list[float] = []
+        begin = frame.stop
+        while frame.stop - begin < MEAN * frame.rate:
+            frame = yield
+            if frame.pressure is not None:
+                means.append(float(frame.pressure.mean()))
+            self._show(frame)
+        return float(np.mean(means)), frame
+
+    def _settle(self, frame: Frame) -> Steps:
+        begin = frame.stop
+        while frame.stop - begin < SETTLE * frame.rate:
+            frame = yield
+            self._show(frame)
+        return frame
+
+    def _show(self, frame: Frame) -> None:
+        if frame.pressure is not None:
+            self._apparatus.tell.progress(float(frame.pressure.mean()), self._goal, "Pa")
+
+
+_RUNNING = (PumpState.INFUSING, PumpState.WITHDRAWING)
