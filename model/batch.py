@@ -66,6 +66,8 @@ class Batch:
     runtime_s: float
     scalar_scenes: int
     """Scenes solved one by one because their contact jumps or their chamber is special."""
+    evaluations: int
+    """Evaluations of the elastic energy."""
 
     def frame(self) -> pd.DataFrame:
         """Return the features as a DataFrame with units in the column names."""
@@ -103,6 +105,7 @@ def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, no
     alone = [k for k, scene in enumerate(scenes) if not _is_regular(scene)]
     kinds: dict[tuple[bool, bool], list[int]] = {}
     irregular = set(alone)
+    evaluations = 0
     for k, scene in enumerate(scenes):
         if k not in irregular:
             kind = (scene.substrate.shape == "sphere", scene.gas.anchor is GasAnchor.VENTED)
@@ -110,7 +113,8 @@ def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, no
     for members in kinds.values():
         for first in range(0, len(members), BLOCK):
             block = members[first : first + BLOCK]
-            values, solved = _solve_block([scenes[k] for k in block], contact_stretch, nodes)
+            values, solved, count = _solve_block([scenes[k] for k in block], contact_stretch, nodes)
+            evaluations += count
             for name in FEATURES:
                 features[name][block] = values[name]
             for name in ERRORS:
@@ -119,6 +123,7 @@ def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, no
     for k in alone:
         prediction = cone.solve(scenes[k], contact_stretch=contact_stretch, points=16)
         outcome[k] = prediction.outcome
+        evaluations += prediction.evaluations.get("elastic energy", 0)
         for name in FEATURES:
             features[name][k] = getattr(prediction, name)
         for name in ERRORS:
@@ -129,6 +134,7 @@ def solve_many(scenes: Sequence[Parameters], *, contact_stretch: bool = True, no
         runtime_s=time.perf_counter() - begin,
         numerical_error=errors,
         scalar_scenes=len(alone),
+        evaluations=evaluations,
         **features,
     )
 
@@ -144,26 +150,26 @@ def _is_regular(scene: Parameters) -> bool:
 
 def _solve_block(
     scenes: Sequence[Parameters], contact_stretch: bool, nodes: int
-) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-    """Return the features of scenes of one kind and which of them are solved."""
+) -> tuple[dict[str, Array], NDArray[np.bool_], int]:
+    """Return the features of scenes of one kind, which of them are solved, and evaluations of the energy."""
     solved = np.zeros(len(scenes), dtype=bool)
     names = (*FEATURES, *(name + " error" for name in ERRORS))
     values = {name: np.full(len(scenes), np.nan) for name in names}
     columns = _columns(scenes, contact_stretch)
     opened = np.flatnonzero(_start_volume(columns.cone) > 0).tolist()
     if not opened:
-        return values, solved
+        return values, solved, 0
     if len(opened) < len(scenes):
         columns = _columns([scenes[k] for k in opened], contact_stretch)
     try:
         with np.errstate(all="ignore"):
             features, fine = _Refinement(columns, nodes).features()
     except NotConverged:
-        return values, solved
+        return values, solved, columns.cone.evaluations.get("elastic energy", 0)
     solved[opened] = fine
     for name in names:
         values[name][opened] = features[name]
-    return values, solved
+    return values, solved, columns.cone.evaluations["elastic energy"]
 
 
 def _start_volume(columns: Cone) -> Array:

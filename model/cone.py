@@ -219,7 +219,13 @@ def sample(branch: Branch, path: Path, marks: tuple[Point, ...], points: int) ->
     edge = cone.edge(radius)
     state, t = settled_state(cone, edge, t, held)
     position = cone.position(edge, t)
-    order = np.argsort(np.concatenate((position, [mark.position for mark in marks])), kind="stable")
+    keys = [
+        np.searchsorted(t[:held], mark.t)
+        if mark.t < pinned.last.t and mark.radius == cone.start_radius
+        else held + np.searchsorted(-radius[held:], -mark.radius)
+        for mark in marks
+    ]
+    order = np.argsort(np.concatenate((np.arange(inner), np.array(keys) - 0.5)), kind="stable")
     marked = [(mark.radius, mark.position, mark.force, cone.pressure(cone.edge(mark.radius), mark.t)) for mark in marks]
     columns = (radius, position, state.force, state.pressure + np.zeros(inner))
     return Profile(

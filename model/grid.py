@@ -68,6 +68,9 @@ class EnergyTable:
             stretch = (np.arcsin(u) / u) ** 2
             self.fixed = self.fixed + self.stiffness * self.r**2 * (stretch + 1 / stretch - 2)
 
+    def differences(self, below: Array, here: Array, above: Array, step: float) -> None:
+        """Nothing: the derivatives are taken at the contact only."""
+
     def row(self, z: float) -> Array:
         """Return Pi(r, z) for all radii."""
         d = self.r.dtype.type(z) + self.h
@@ -85,6 +88,23 @@ class EnergyTable:
         return total
 
 
+class DescribedTable(EnergyTable):
+    """The same row by row, with nothing kept from one row to the next."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._arguments = arguments
+
+    def row(self, z: float) -> Array:
+        """Return Pi(r, z) for all radii, every factor of it evaluated anew."""
+        return EnergyTable(*self._arguments).row(z)
+
+    def differences(self, below: Array, here: Array, above: Array, step: float) -> None:
+        """Evaluate both derivatives at all radii."""
+        np.gradient(here, self.r)
+        np.divide(np.subtract(above, below), 2 * step)
+
+
 def solve(
     parameters: Parameters,
     *,
@@ -92,8 +112,12 @@ def solve(
     positions: int = PAPER_GRID[0],
     radii: int = PAPER_GRID[1],
     dtype: Any = np.float64,
+    as_described: bool = False,
 ) -> GridResult:
     """Read the features off a grid of ``positions`` heights times ``radii`` contact radii.
+
+    ``as_described`` evaluates the energy as printed at every point of the grid and both of its derivatives
+    everywhere; otherwise what depends on the radius alone is computed once, and the force at the contact only.
 
     Raises
     ------
@@ -110,8 +134,8 @@ def solve(
         if detached > start + reach / 4:
             break
         reach /= 2
-    table = EnergyTable(parameters, contact_stretch, radii, dtype)
     heights = np.linspace(start, detached + 2 * reach / 400, positions)
+    table: EnergyTable = (DescribedTable if as_described else EnergyTable)(parameters, contact_stretch, radii, dtype)
     force, zero, detachment, evaluations = _walk(table, heights)
     if not math.isfinite(force):
         raise NotConverged(f"a grid of {positions} x {radii} does not resolve the contact")
@@ -127,6 +151,7 @@ def _walk(table: EnergyTable, heights: Array) -> tuple[float, float, float, int]
     for z in heights:
         above = table.row(z + step)
         rows += 1
+        table.differences(below, here, above, step)
         index = _critical(here, index)
         if index < 0:
             break

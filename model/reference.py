@@ -228,6 +228,12 @@ class _Polish:
     def onset(self) -> Any:
         """Return the largest z at which the contact is held at r_i."""
         above = self.z[0] + (self.z[1] - self.z[0] if self.z.size > 1 else 1e-3 * abs(self.z[0]) + 1e-9)
+        step = above - self.z[0]
+        for _ in range(20):
+            if self.derivative(self.r_i, mpmath.mpf(above), 1, 0) > 0:
+                break
+            step *= 2
+            above += step
         return self.root(lambda z: self.derivative(self.r_i, z, 1, 0), self.onset_below(), above)
 
     def onset_below(self) -> Any:
@@ -318,8 +324,16 @@ class _Polish:
         def forceless(r: Any) -> Any:
             return self.root(lambda z: self.force(r, z), z_low - 4 * margin, z_high + 4 * margin, 24)
 
-        r_high = min(self.r_i, mpmath.mpf(r_high + margin))
-        return forceless(self.root(lambda r: self.derivative(r, forceless(r), 1, 0), r_low - margin, r_high, 24))
+        def residual(r: Any) -> Any:
+            return self.derivative(r, forceless(r), 1, 0)
+
+        low, high = mpmath.mpf(r_low - margin), min(self.r_i, mpmath.mpf(r_high + margin))
+        for _ in range(8):
+            if (residual(low) < 0) != (residual(high) < 0):
+                break
+            margin *= 1.5
+            low, high = mpmath.mpf(r_low - margin), min(self.r_i, mpmath.mpf(r_high + margin))
+        return forceless(self.root(residual, low, high, 24))
 
     def peak(self, onset: Any, detachment: tuple[Any, Any]) -> tuple[Any, Any]:
         """Return the most tensile force and its z."""
