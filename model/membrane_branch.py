@@ -207,6 +207,8 @@ def _accepted(
         return None
     if relative_size(solved.state, solved.state - guess, widths)[0] > surprise:
         return None
+    if closure is Closure.RELEASE and not release_slope(annulus, widths, solved.state)[0] > 0:
+        return None  # a lower root: z_eq is the largest
     return solved.state
 
 
@@ -282,15 +284,7 @@ def _both_ways(annulus: Annulus, start: float, state: Array, width: float, count
         if further.coordinate.size == 1:
             break
         line = _join(line, further)
-    return _upper(annulus, line, start)
-
-
-def _upper(annulus: Annulus, line: Line, start: float) -> Line:
-    """Return the part of a line around ``start`` on which z_eq is the upper root."""
-    lower = np.flatnonzero(release_slope(annulus, line.coordinate, line.state) <= 0)
-    low = max((int(i) + 1 for i in lower if line.coordinate[i] < start), default=0)
-    high = min((int(i) for i in lower if line.coordinate[i] > start), default=line.coordinate.size)
-    return Line(line.coordinate[low:high], line.state[low:high])
+    return line
 
 
 def _join(first: Line, second: Line) -> Line:
