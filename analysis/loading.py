@@ -34,11 +34,9 @@ def deviation(depth: Array, force: Array, sigma: float) -> int:
     1. The first point from which on five points in a row lie more than four standard deviations off zero.
     2. A line through the next points, up to three times that force, is extended back to zero force, if it leads back.
     """
-    off = np.abs(force) > 4 * sigma
-    lasting = np.flatnonzero(np.convolve(off, np.ones(5), mode="valid") == 5)
-    if lasting.size == 0:
-        return force.size - 1
-    first = int(lasting[0])
+    first = _lasting_deviation(force, sigma)
+    if first > force.size - 3:
+        return first
     beyond = np.flatnonzero(np.abs(force[first:]) > 12 * sigma)
     last = min(force.size, first + (int(beyond[0]) if beyond.size else 5) + 2)
     slope, offset = np.polyfit(depth[first:last], force[first:last], 1)
@@ -47,17 +45,24 @@ def deviation(depth: Array, force: Array, sigma: float) -> int:
     return int(np.clip(np.searchsorted(depth, -offset / slope), 0, first))
 
 
+def _lasting_deviation(force: Array, sigma: float) -> int:
+    """Return the first of five points in a row beyond four standard deviations; the last point where there is none."""
+    off = np.abs(force) > 4 * sigma
+    lasting = np.flatnonzero(np.convolve(off, np.ones(5), mode="valid") == 5)
+    return int(lasting[0]) if lasting.size else force.size - 1
+
+
 @contact_method("constant and polynomial")
 def constant_and_polynomial(depth: Array, force: Array, sigma: float) -> int:
     """Piecewise fit.
 
-    1. Use the curve up to the first fifth of its largest force.
+    1. Use the curve up to a tenth of the way from its first lasting deviation (four standard deviations) to its end.
     2. For each candidate, force is zero before and a + b x + c x^2 with x the depth beyond the candidate, by least
        squares; a is the snap-in.
     3. The candidate with the smallest sum of squares is the contact.
     """
-    del sigma
-    stop = min(force.size, max(12, int(np.argmax(force > 0.2 * force.max())) or force.size))
+    first = _lasting_deviation(force, sigma)
+    stop = min(force.size, first + max(12, (force.size - first) // 10))
     depth, force = depth[:stop] - depth[0], force[:stop]
     candidates = np.arange(0, stop - 6)
     for stride in (max(1, candidates.size // 60), 1):
@@ -125,7 +130,7 @@ def contact(work: Extraction) -> Details:
 def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
     """Return depth (rising evenly) and force of the approach, averaged in cells of depth, and the noise of one cell.
 
-    What noise and drift leave before contact counts where it is larger than the noise alone.
+    A line through the part before contact is removed: here drift within the approach counts, not over the whole test.
     """
     if work.windows.approach is None:
         raise FeatureMissing("the run has no approach")
@@ -146,8 +151,9 @@ def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
     grid = np.linspace(first, float(depth[-1]), cells)
     per_cell = samples / max(1.0, cells * (touch - first) / (grid[-1] - first))
     force = on_grid(depth, work.force[start:stop], grid)
-    before = force[grid < touch - 0.1 * (touch - first)]
-    return grid, force, max(work.noise.of_mean(per_cell), float(np.sqrt(np.mean(before**2))))
+    before = grid < touch - 0.1 * (touch - first)
+    force = force - np.polynomial.Polynomial.fit(grid[before], force[before], 1)(grid)
+    return grid, force, max(work.noise.of_mean(per_cell), float(force[before].std()))
 
 
 @extraction_step(

@@ -90,8 +90,8 @@ def _moves(height: Array, window: tuple[int, int] | None, direction: int) -> boo
 def tare(work: Extraction) -> Details:
     """Fit one straight line in time to all force-free samples: tare, approach before contact, and after detachment.
 
-    1. Level and noise from the tare. Going back from the end of the approach, contact begins after the last sample
-       whose running mean lies within five standard deviations of that level; a margin before it is left out.
+    1. Level and noise from the tare. Contact is where the force leaves it for good, up or (snap-in) down; a margin
+       before it is left out.
     2. The sample has come off when the force ends within a quarter of the largest tension from the level; detachment
        is the last crossing of three per cent of it.
     3. Block means before contact and after detachment, equally weighted, give level and drift by least squares.
@@ -133,16 +133,28 @@ def _without_trend(values: Array) -> Array:
 
 
 def _contact_onset(work: Extraction, smooth: Array, level: float, sigma: float) -> int:
-    """Return the first sample of the approach from which the force departs for good: up, or down in a snap-in."""
+    """Return the first sample of contact in the approach, whether the force rises or falls (snap-in) there.
+
+    Contact is certain where the force first stays off the tare by one per cent of its largest value. From there back,
+    it began after the last sample within five standard deviations of a line through all samples well before.
+    """
     window = work.windows.approach
     if window is None:
         return work.windows.free[1]
-    departed = (np.abs(smooth[window[0] : window[1]] - level) > 5 * sigma).astype(np.float64)
+    force = smooth[window[0] : window[1]] - level
+    departed = (np.abs(force) > max(5 * sigma, 0.01 * float(np.abs(force).max()))).astype(np.float64)
     ahead = max(2, round(0.2 * work.run.rate))
     total = np.concatenate([[0.0], np.cumsum(departed), np.full(ahead, departed.sum())])
     share = (total[ahead : ahead + departed.size] - total[: departed.size]) / ahead
     lasting = np.flatnonzero((departed > 0) & (share > 0.8))
-    return window[0] + (int(lasting[0]) if lasting.size else departed.size)
+    if lasting.size == 0:
+        return window[1]
+    certain = window[0] + int(lasting[0])
+    before = (work.windows.free[0], max(work.windows.free[1], certain - ahead))
+    line = fit_line(work.run.force, [before])
+    places = np.arange(before[0], certain, dtype=np.float64)
+    quiet = np.flatnonzero(np.abs(smooth[before[0] : certain] - line(places)) < 5 * sigma)
+    return before[0] + int(quiet[-1]) if quiet.size else certain
 
 
 def _rough_detachment(work: Extraction, smooth: Array, level: float, sigma: float) -> int | None:

@@ -22,6 +22,10 @@ OFFSETS = {1: (-9, 8), 2: (-9, 6), 3: (0, -15), 4: (10, 8), 5: (0, -14), 6: (-10
 """Where each number stands beside its point, in points, so that moments close in time stay legible."""
 
 
+LABEL = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
+"""Keeps a label legible over a line."""
+
+
 def overview(run: Run, analysis: Analysis, prediction: Prediction | None, path: Path) -> None:
     """Draw one run and save it; the ending of ``path`` chooses PNG, SVG or PDF.
 
@@ -178,6 +182,7 @@ def _annotate(axes: Axes, analysis: Analysis) -> None:
             ha="center",
             va="top",
             fontsize=8,
+            bbox=LABEL,
         )
     if "pull_off_distance_m" in features:
         distance = features.value("pull_off_distance_m") * 1e3
@@ -190,4 +195,5 @@ def _annotate(axes: Axes, analysis: Analysis) -> None:
             ha="right",
             va="bottom",
             fontsize=8,
+            bbox=LABEL,
         )
