@@ -39,8 +39,8 @@ STEPS = ("tare", "approach", "preload", "dwell", "pressurize", "retract", "pull-
 TO_PRESSURIZE = STEPS[:5]
 REPEATED = ("preload", "pressurize", "retract")
 MOVING = ("approach", "preload", "retract", "pull-off", "return")
-PROTOCOL = {**SHORT, "tare_s": 0.3, "preload_dwell_s": 0.5, "retract_speed_um_s": 200.0}
-START_MM = 20.6
+PROTOCOL = {**SHORT, "tare_s": 0.3, "preload_dwell_s": 0.5, "retract_speed_um_s": 200.0, "approach_speed_um_s": 200.0}
+START_MM = 22.5
 LATER = 100
 """Samples between the beginning of a step and the fault."""
 
@@ -492,7 +492,7 @@ def page(verdicts: Sequence[Verdict]) -> str:
     lines = [
         "# The fault matrix",
         "",
-        "Every step of a pull-off test times every fault. Made by `pytest -m soak tests/test_fault_matrix.py`; do not edit.",
+        "Every step of a pull-off test times every fault. Made by `pytest -m soak tests/test_fault_matrix.py`.",
         "",
         f"{len(verdicts)} cells, {sum(not v.unsafe for v in verdicts)} safe (stage and pump at rest, true force within "
         f"the limits), {sum(not v.lost for v in verdicts)} with the data intact (plain h5py opens the recording, every "
