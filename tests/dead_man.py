@@ -68,9 +68,10 @@ def bench_file(folder: Path, ends: dict[str, str], **daq: float) -> Path:
     for device in ("stage", "pump", "daq"):
         text = text.replace('connection = "emulated"', f'connection = "{ends[device]}"', 1)
     for key, value in daq.items():
-        text = "\n".join(f"{key} = {value}" if line.startswith(f"{key} ") else line for line in text.splitlines())
+        lines = (f"{key} = {value}" if line.startswith(f"{key} ") else line for line in text.splitlines())
+        text = "\n".join(lines) + "\n"
     path = folder / "bench.toml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(f"{text}lag_s = 10.0\n", encoding="utf-8")  # the computer of a test may be busy with others
     return path
 
 
