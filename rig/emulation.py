@@ -92,9 +92,9 @@ class Hands(Watcher):
         """Answer a prompt."""
         if event.kind != "prompt":
             return
-        hung = re.match(r"hang ([0-9.e+-]+) g", event.text)
-        if hung:
+        weight = re.match(r"Hang ([0-9.e+-]+) g|Take every weight off", event.text)
+        if weight:
             from drivers.emulated.specimens import DeadWeight
 
-            self._world.plant.mount(DeadWeight(float(hung[1]) * 1e-3))
+            self._world.plant.mount(DeadWeight(float(weight[1] or 0.0) * 1e-3))
         self._controls.resume()

@@ -78,6 +78,7 @@ class Reporter:
         self._step = ""
         self._frames = 0
         self.sample = 0
+        self._asked = False
 
     def add(self, observer: Observer) -> None:
         """Tell one more observer from now on."""
@@ -106,6 +107,16 @@ class Reporter:
     def note(self, text: str) -> None:
         """A line of the sequence."""
         self.event("note", text)
+
+    def ask(self, text: str) -> None:
+        """Ask the operator for a hand; the loop holds until the run is resumed."""
+        self.event("prompt", text)
+        self._asked = True
+
+    def take_question(self) -> bool:
+        """Return whether the operator was asked since the last call."""
+        asked, self._asked = self._asked, False
+        return asked
 
     def event(self, kind: str, text: str) -> None:
         """A line for the log."""
@@ -193,10 +204,19 @@ class Loop:
                 self._obey(self._controls.take())
                 if not self._holding:
                     sequence.send(frame)
+                    self._holding = self._reporter.take_question()
         except StopIteration:
             return
-        finally:
+        except BaseException:
+            self._leave(sequence)
+            raise
+
+    def _leave(self, sequence: Sequencer) -> None:
+        """Let the step stop what it started; if that fails too, the first failure stays the one that is told."""
+        try:
             sequence.close()
+        except Exception as error:  # noqa: BLE001 - whatever the driver raises, the safe state tries again
+            self._reporter.event("fault", f"leaving step {self._reporter.step}: {error}")
 
     def _frames(self) -> Generator[Frame, None, None]:
         stage, daq, clock = self._instruments.stage, self._instruments.daq, self._instruments.clock

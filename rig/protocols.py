@@ -15,7 +15,7 @@ from rig.scene import (
 from sequences import calibration, chamber
 from sequences.pressurize import Chamber
 from sequences.pull_off import PullOff, PullOffSettings
-from sequences.step import Apparatus, Step
+from sequences.step import Apparatus, Step, by_hand
 
 
 def build_steps(scene: Scene, apparatus: Apparatus) -> list[Step]:
@@ -35,7 +35,8 @@ def build_steps(scene: Scene, apparatus: Apparatus) -> list[Step]:
     test = PullOff(apparatus, contact_settings(scene, protocol))
     if isinstance(protocol, ComplianceSection):
         back = calibration.unload(apparatus, protocol.retract_speed_um_s * 1e-6, protocol.unload_um * 1e-6)
-        return [*test.contact_steps(), back]
+        stop = by_hand(apparatus, "place", "the operator goes on", "Put the rigid stop under the probe")
+        return [stop, *test.contact_steps(), back]
     return test.steps()
 
 

@@ -5,37 +5,42 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sequences.frame import Frame
-from sequences.step import Apparatus, Motion, Step, Steps, rest
+from sequences.step import Apparatus, Motion, Step, Steps, by_hand, rest
+
+WEIGH = "weigh"
+"""First word of the steps in which a known mass hangs still."""
+
+
+def weighing_order(masses: Sequence[float]) -> list[float]:
+    """Return the masses in the order they are hung: up and down again, so that hysteresis shows."""
+    return [*masses, *reversed(masses[:-1])]
 
 
 def dead_weights(apparatus: Apparatus, masses: Sequence[float], seconds: float) -> list[Step]:
     """Return the steps of a load cell calibration: hang each mass (kg), confirm, record; up and down again."""
 
-    def ask(mass: float) -> Step:
-        def act(frame: Frame) -> Steps:
-            apparatus.tell.ask(f"hang {mass * 1e3:g} g on the gripper, wait until it is still, then go on")
-            return (yield)
+    def hang_and_weigh(number: int, mass: float) -> list[Step]:
+        load = f"{mass * 1e3:g} g" + (" going down" if number >= len(masses) else "")
+        request = f"Hang {mass * 1e3:g} g on the gripper" if mass else "Take every weight off the gripper"
+        return [
+            by_hand(apparatus, f"hang {load}", "the operator goes on", f"{request}, wait until it is still"),
+            Step(f"{WEIGH} {load}", f"{seconds:g} s at rest", lambda frame: rest(apparatus, seconds, frame)),
+        ]
 
-        return Step("prompt", f"{mass * 1e3:g} g hung", act)
-
-    def weigh(mass: float) -> Step:
-        return Step(f"weight {mass * 1e3:g} g", f"{seconds:g} s at rest", lambda frame: rest(apparatus, seconds, frame))
-
-    order = [*masses, *reversed(masses[:-1])]
-    return [step for mass in order for step in (ask(mass), weigh(mass))]
+    order = weighing_order(masses)
+    return [step for number, mass in enumerate(order) for step in hang_and_weigh(number, mass)]
 
 
 def pressure_zero(apparatus: Apparatus, seconds: float) -> list[Step]:
     """Return the steps of a pressure zero: open the sensor's port to the room, confirm, average."""
 
-    def ask(frame: Frame) -> Steps:
-        apparatus.tell.ask("open the sensor's port to the room, then go on")
-        return (yield)
-
     def average(frame: Frame) -> Steps:
         return rest(apparatus, seconds, frame)
 
-    return [Step("prompt", "the port is open", ask), Step("zero", f"{seconds:g} s at rest", average)]
+    return [
+        by_hand(apparatus, "open", "the operator goes on", "Open the sensor's port to the room"),
+        Step("zero", f"{seconds:g} s at rest", average),
+    ]
 
 
 def unload(apparatus: Apparatus, speed: float, distance: float) -> Step:
@@ -53,4 +58,4 @@ def unload(apparatus: Apparatus, speed: float, distance: float) -> Step:
             apparatus.stage.stop()
         return frame
 
-    return Step("unload", "clear of the stop", act)
+    return Step("unload", f"{distance * 1e6:g} um further up, clear of the stop", act)

@@ -89,6 +89,16 @@ def rest(apparatus: Apparatus, seconds: float, frame: Frame) -> Steps:
     return frame
 
 
+def by_hand(apparatus: Apparatus, name: str, condition: str, request: str) -> Step:
+    """Return the step that asks the operator for a hand and waits until he lets the run go on."""
+
+    def act(frame: Frame) -> Steps:
+        apparatus.tell.ask(f"{request}, then go on")
+        return (yield)
+
+    return Step(name, condition, act)
+
+
 @contextmanager
 def stopping_on_failure(stage: Stage) -> Iterator[None]:
     """Stop the stage if the step is left by an error or closed; a step that ends well hands its motion on."""
