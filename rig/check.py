@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 from rig.bench import Bench
 from rig.errors import Refused
-from rig.scene import PullOffSection, Scene
+from rig.scene import ContactSection, DeadWeightsSection, LeakSection, PullOffSection, Scene, VolumeSection
 
 STOPPING_MARGIN = 1.5
 """Room for the frame that is under way when a limit is passed."""
+
+RESOLUTION = 10.0
+"""A preload is worth setting if it is so many times what the load cell is known to."""
+
+
+REACTION_S = 0.03
+"""From the end of a frame to the stop byte at the stage: p99 on a loaded computer (docs/reliability.md)."""
+OVERLOAD = 1.2
+"""What a load cell survives, in capacities."""
 
 
 def check(scene: Scene, bench: Bench) -> None:
@@ -19,6 +30,7 @@ def check(scene: Scene, bench: Bench) -> None:
         Names every reason with value, limit and remedy.
     """
     reasons = [*_instruments(scene, bench), *_forces(scene, bench), *_pressure(scene, bench), *_speeds(scene, bench)]
+    reasons += _overruns(scene, bench)
     if reasons:
         raise Refused(f"scene {scene.title!r} cannot run on bench {bench.title!r}: " + "; ".join(reasons))
 
@@ -41,9 +53,78 @@ def _forces(scene: Scene, bench: Bench) -> list[str]:
     ]
 
 
+def _resolution(scene: Scene, bench: Bench) -> list[str]:
+    """A force the load cell does not resolve can neither be reached nor measured."""
+    protocol = scene.protocol
+    known = bench.force.calibration.residual
+    if not isinstance(protocol, ContactSection) or protocol.preload_N >= RESOLUTION * known:
+        return []
+    return [
+        f"preload_N = {protocol.preload_N:g} is less than {RESOLUTION:g} times what the load cell {bench.force.cell} is "
+        f"known to (residual = {known:g} N); fit a smaller load cell and name its bench file "
+        "(emulated: --bench emulated-gso25)"
+    ]
+
+
+def _tension(scene: Scene, bench: Bench) -> list[str]:
+    """Forces that are known before: hung weights, and the soft gripper's from the published table."""
+    limit = min(bench.limits.tension_N, bench.force.capacity_N)
+    protocol = scene.protocol
+    if isinstance(protocol, DeadWeightsSection):
+        heaviest = max(protocol.masses_g) * 1e-3 * protocol.gravity_m_s2
+        if heaviest <= limit:
+            return []
+        return [
+            f"masses_g: {max(protocol.masses_g):g} g pull with {heaviest:.3g} N, the tension limit is {limit:g} N; "
+            "leave the heavy ones out, or raise tension_N as far as the load cell allows"
+        ]
+    expected = _published_force(scene)
+    if expected is None or expected <= limit:
+        return []
+    return [
+        f"the soft gripper is known to pull with about {expected:.2f} N (PNAS SI Table S2), the tension limit is "
+        f"{limit:g} N; raise tension_N as far as the load cell allows, or choose a pressure nearer to zero"
+    ]
+
+
+def _published_force(scene: Scene) -> float | None:
+    """Pull-off force of the soft gripper, N, a straight line between the pressures of Table S2; else ``None``."""
+    protocol = scene.protocol
+    if scene.gripper.kind != "soft" or not isinstance(protocol, PullOffSection):
+        return None
+    from drivers.emulated.soft import SoftGripper
+
+    diameter = scene.substrate.diameter_mm if scene.substrate.shape == "sphere" else None
+    gripper = SoftGripper() if diameter is None else SoftGripper(diameter * 1e-3)
+    return gripper.pull_off_force((protocol.initial_pressure_kPa or 0.0) * 1e3)
+
+
+def _strokes(scene: Scene, bench: Bench) -> list[str]:
+    """The pump's strokes must stay within the syringe and the pressure limits."""
+    protocol = scene.protocol
+    if not isinstance(protocol, VolumeSection) or bench.pump is None:
+        return []
+    pumped = list(accumulate(protocol.strokes_ml))
+    reasons = []
+    reach = max(pumped + [0.0]) - min(pumped + [0.0])
+    if reach > 0.8 * bench.pump.syringe_volume_ml:
+        available = 0.8 * bench.pump.syringe_volume_ml
+        reasons.append(f"strokes_ml: they span {reach:g} ml, {available:g} ml of the syringe can be used; shorten them")
+    volume, atmosphere = scene.gripper.chamber_volume_ml, scene.gas.atmospheric_pressure_kPa
+    low, high = bench.limits.pressure_low_kPa, bench.limits.pressure_high_kPa
+    for amount in pumped:
+        pressure = atmosphere * amount / (volume - amount) if amount < volume else float("inf")
+        if not low <= pressure <= high:
+            reasons.append(
+                f"strokes_ml: {amount:+g} ml in the chamber make about {pressure:+.3g} kPa, the bench allows {low:g} to "
+                f"{high:g} kPa; shorten the strokes"
+            )
+    return reasons
+
+
 def _pressure(scene: Scene, bench: Bench) -> list[str]:
     protocol = scene.protocol
-    pressure = protocol.initial_pressure_kPa if isinstance(protocol, PullOffSection) else None
+    pressure = protocol.initial_pressure_kPa if isinstance(protocol, PullOffSection | LeakSection) else None
     if pressure is None or bench.pump is None:
         return []
     low, high = bench.limits.pressure_low_kPa, bench.limits.pressure_high_kPa
@@ -71,3 +152,37 @@ def _speeds(scene: Scene, bench: Bench) -> list[str]:
         for key in keys
         if (speed := getattr(scene.protocol, key, 0.0)) > fastest
     ]
+
+
+def _overruns(scene: Scene, bench: Bench) -> list[str]:
+    """What the stage may travel too far, against a rigid stop, must not overload the cell.
+
+    It goes on for a frame and the reaction after a limit is passed, and for the look-ahead if this program dies just
+    before the preload is reached.
+    """
+    speed = getattr(scene.protocol, "approach_speed_um_s", None)
+    if speed is None:
+        return []
+    compliance, overload = bench.force.compliance_um_per_N, OVERLOAD * bench.force.capacity_N
+    if compliance == 0.0:
+        return [
+            "force.compliance_um_per_N of the bench is 0: nobody knows how fast the force rises on contact; "
+            "press a rigid stop and fit travel against force"
+        ]
+    reasons = []
+    delay = bench.daq.frame_ms * 1e-3 + REACTION_S
+    fastest = (overload - bench.limits.compression_N) * compliance / delay
+    if speed > fastest:
+        reasons.append(
+            f"approach_speed_um_s = {speed:g} would overload the load cell: the stop takes {delay * 1e3:g} ms and the "
+            f"force rises by 1 N in {compliance:g} um (at most {fastest:.3g} um/s); approach more slowly, lower "
+            "compression_N or shorten frame_ms"
+        )
+    preload = getattr(scene.protocol, "preload_N", 0.0)
+    furthest = (overload - preload) * compliance
+    if bench.limits.look_ahead_um > furthest:
+        reasons.append(
+            f"look_ahead_um = {bench.limits.look_ahead_um:g} would overload the load cell if this computer died at the "
+            f"preload (at most {furthest:.3g} um); shorten it"
+        )
+    return reasons

@@ -17,6 +17,7 @@ from drivers.errors import SensorFault
 from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage, StageStatus
 from rig.errors import Interlock, StoppedByOperator
 from rig.interlocks import Interlocks
+from rig.latency import Latencies
 from rig.observe import Controls, Event, Observer, StepEvent, StepPhase, Wish
 from rig.timebase import TimeBase
 from sequences.frame import Frame
@@ -182,6 +183,7 @@ class Loop:
         self._holding = False
         self.samples = 0
         self.interlock_latency: float | None = None
+        self.checks = Latencies()
 
     def run(self, sequence: Sequencer) -> None:
         """Run until the sequence ends. Leaves the instruments as they are: the caller makes them safe.
@@ -246,6 +248,7 @@ class Loop:
             self.interlock_latency = time.perf_counter() - began
             self._keep_last(volts, force, pressure)
             raise
+        self.checks.add(time.perf_counter() - began)
         return force, pressure
 
     def _keep_last(self, volts: Array, force: Array, pressure: Array | None) -> None:

@@ -138,6 +138,7 @@ def _recorded(request: Request, opened: Opened) -> Ending:
         ending = _play(loop, steps, reporter)
     finally:
         failures = make_safe(stage, pump, opened.daq)
+        reporter.event("timing", f"frame to interlocks passed: {loop.checks.describe()} of {loop.checks.count} frames")
         ending = _finish(recorder, reporter, ending, failures, loop.samples)
     reporter.store = None  # closed
     reporter.notify("finished", ending)
