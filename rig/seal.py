@@ -15,7 +15,8 @@ from pathlib import Path
 from rig.errors import FileError
 
 MARK = b"\nRIGSEAL1"
-PROBE_SECONDS = 60.0
+PROBE_SECONDS = 20.0
+PROBE_BYTES_PER_SECOND = 10e6
 _LENGTH = len(MARK) + 32
 
 
@@ -42,11 +43,12 @@ def probe(path: Path) -> None:
         It cannot be read, or reading it crashes or does not end.
     """
     command = [sys.executable, "-m", "rig.seal", str(path)]
+    patience = PROBE_SECONDS + path.stat().st_size / PROBE_BYTES_PER_SECOND
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=patience, check=False)
     except subprocess.TimeoutExpired as error:
         raise FileError(
-            f"recording {path}: damaged: reading it does not end within {PROBE_SECONDS:g} s. Remedy: restore a copy."
+            f"recording {path}: damaged: reading it does not end within {patience:.0f} s. Remedy: restore a copy."
         ) from error
     if done.returncode:
         lines = done.stderr.strip().splitlines()
