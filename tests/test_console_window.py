@@ -349,7 +349,7 @@ def test_nothing_to_attach_to_is_said(console: Console) -> None:
 
 def test_command_lines_of_children() -> None:
     assert run_arguments("a", None, "1", 3) == ["run", "a", "--link", "--repeat", "3", "--speed", "1"]
-    assert "--speed" not in run_arguments("a", Path("b.toml"), "1", 1)
+    assert run_arguments("a", Path("b.toml"), None, 1)[-2:] == ["--bench", "b.toml"]
     words = replay_arguments(Path("r.h5"), "membrane", ("membrane.thickness_um=180",))
     assert words[:2] == ["replay", "r.h5"]
     assert words[-4:] == ["--model", "membrane", "--set", "membrane.thickness_um=180"]

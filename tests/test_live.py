@@ -40,7 +40,7 @@ def specimen(work: float = 1.0, pressure: float = 1000.0) -> Parameters:
 def glances(truth: Parameters, *, noise: float = 3e-4, seed: int = 1, shape: float = 0.0) -> list[tuple[str, Glance]]:
     """Frames of a test whose specimen is the model with other values, plus a smooth deviation if asked for."""
     found = predict(truth)
-    start = found.position[0] + 50e-6
+    start = found.position[0] + 150e-6
     random = np.random.default_rng(seed)
     plan: list[tuple[str, np.ndarray]] = [
         ("tare", np.full(50, 1e-3)),

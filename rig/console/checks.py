@@ -33,7 +33,7 @@ def check_scene(name: str, bench_path: Path | None) -> Checked:
         scene = parse_scene(*find_scene(name))
         bench, _ = load_bench(bench_path)
     except RigError as error:
-        return Checked(None, bench_path is None, (), (str(error),))
+        return Checked(None, True, (), (str(error),))
     try:
         check(scene, bench)
     except Refused as error:

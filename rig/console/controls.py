@@ -104,7 +104,6 @@ class RunControls(QWidget):
         """Offer what makes sense now."""
         for widget in (self.scene, self.bench, self.repeats, self.check, self.open, self.attach):
             widget.setEnabled(not running)
-        self.speed.setVisible(self.bench.currentData() is None)
         self.speed.setEnabled(not running)
         self.run.setEnabled(ready and not running)
         self.hold.setEnabled(running and commands and not holding)

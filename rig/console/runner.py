@@ -64,10 +64,12 @@ class Child:
             self._output.unlink(missing_ok=True)
 
 
-def run_arguments(scene: str, bench: Path | None, speed: str, repeats: int) -> list[str]:
-    """Return the command line of a run."""
+def run_arguments(scene: str, bench: Path | None, speed: str | None, repeats: int) -> list[str]:
+    """Return the command line of a run; ``speed`` is ``None`` for real instruments."""
     words = ["run", scene, "--link", "--repeat", str(repeats)]
-    return words + (["--speed", speed] if bench is None else ["--bench", str(bench)])
+    if bench is not None:
+        words += ["--bench", str(bench)]
+    return words if speed is None else [*words, "--speed", speed]
 
 
 def replay_arguments(recording: Path, model: str | None = None, changes: Sequence[str] = ()) -> list[str]:

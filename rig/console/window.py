@@ -288,9 +288,9 @@ class Console(QMainWindow):
         if self.checked is None or not self.checked.ready:
             return
         controls = self.controls
-        arguments = run_arguments(
-            controls.scene.currentText(), controls.bench_path, controls.speed.currentData(), controls.repeats.value()
-        )
+        speed = controls.speed.currentData() if self.checked.emulated else None
+        scene, repeats = controls.scene.currentText(), controls.repeats.value()
+        arguments = run_arguments(scene, controls.bench_path, speed, repeats)
         self._known = {}
         self.start(Child(arguments), replaying=False)
 
@@ -628,6 +628,7 @@ class Console(QMainWindow):
         self.transport.setVisible(self._replaying)
         self.emergency.setEnabled(going and not self._replaying)
         ready = self.checked is not None and self.checked.ready
+        self.controls.speed.setVisible(self.checked is None or self.checked.emulated)
         self.controls.enable(ready=ready, running=going, commands=self.link is not None, holding=self.holding)
 
     def _set_state(self, words: str, tone: str) -> None:
