@@ -157,8 +157,8 @@ def _speeds(scene: Scene, bench: Bench) -> list[str]:
 def _overruns(scene: Scene, bench: Bench) -> list[str]:
     """What the stage may travel too far, against a rigid stop, must not overload the cell.
 
-    It goes on for a frame and the reaction after a limit is passed, and for the look-ahead if this program dies just
-    before the preload is reached.
+    A limit that is passed stops it a frame and the reaction later; data that come late, as late as the bench allows,
+    stop it so much after the preload; and if this program dies just before the preload, it goes on for the look-ahead.
     """
     speed = getattr(scene.protocol, "approach_speed_um_s", None)
     if speed is None:
@@ -169,16 +169,19 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
             "force.compliance_um_per_N of the bench is 0: nobody knows how fast the force rises on contact; "
             "press a rigid stop and fit travel against force"
         ]
-    reasons = []
-    delay = bench.daq.frame_ms * 1e-3 + REACTION_S
-    fastest = (overload - bench.limits.compression_N) * compliance / delay
-    if speed > fastest:
-        reasons.append(
-            f"approach_speed_um_s = {speed:g} would overload the load cell: the stop takes {delay * 1e3:g} ms and the "
-            f"force rises by 1 N in {compliance:g} um (at most {fastest:.3g} um/s); approach more slowly, lower "
-            "compression_N or shorten frame_ms"
-        )
     preload = getattr(scene.protocol, "preload_N", 0.0)
+    reaction = bench.daq.frame_ms * 1e-3 + REACTION_S
+    late = reaction + bench.limits.lag_s
+    fastest = {
+        "lower compression_N or shorten frame_ms": (overload - bench.limits.compression_N) * compliance / reaction,
+        "lower preload_N or shorten lag_s": (overload - preload) * compliance / late,
+    }
+    reasons = [
+        f"approach_speed_um_s = {speed:g} can overload the load cell, whose force rises by 1 N in {compliance:g} um "
+        f"(at most {most:.3g} um/s); approach more slowly, {remedy}"
+        for remedy, most in fastest.items()
+        if speed > most
+    ]
     furthest = (overload - preload) * compliance
     if bench.limits.look_ahead_um > furthest:
         reasons.append(

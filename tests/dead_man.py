@@ -42,6 +42,10 @@ class Halt:
     recording: Path
 
 
+class Overtaken(Exception):
+    """This computer was too busy for real time: the run has stopped itself before it could be killed."""
+
+
 @contextlib.contextmanager
 def emulators(*options: str) -> Iterator[tuple[dict[str, str], Any]]:
     """Serve the emulated bench from another process; yield its endpoints and what ends it and returns its log."""
@@ -71,7 +75,7 @@ def bench_file(folder: Path, ends: dict[str, str], **daq: float) -> Path:
         lines = (f"{key} = {value}" if line.startswith(f"{key} ") else line for line in text.splitlines())
         text = "\n".join(lines) + "\n"
     path = folder / "bench.toml"
-    path.write_text(f"{text}lag_s = 10.0\n", encoding="utf-8")  # the computer of a test may be busy with others
+    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -93,11 +97,22 @@ def wait_for_step(stream: IO[str], step: str) -> None:
         said.append(line)
         if f" s  {step} " in line and "until" in line:
             return
-    raise AssertionError(f"the run never came to {step}: {''.join(said)}")
+    text = "".join(said)
+    if "s late" in text:
+        raise Overtaken(text)
+    raise AssertionError(f"the run never came to {step}: {text}")
 
 
 def kill_in(step: str, delay: float, folder: Path, seed: int = 0) -> Halt:
-    """Kill a run so many seconds into a step."""
+    """Kill a run so many seconds into a step; try again where this computer was too busy for a run in real time."""
+    for _ in range(10):
+        with contextlib.suppress(Overtaken):
+            return _kill_in(step, delay, folder, seed)
+        (folder / "run.h5").unlink()
+    raise AssertionError("this computer is too busy for a run in real time")
+
+
+def _kill_in(step: str, delay: float, folder: Path, seed: int) -> Halt:
     with emulators("--seed", str(seed)) as (ends, finish):
         with start_run(folder, ends) as run:
             assert run.stderr is not None

@@ -41,6 +41,8 @@ REPEATED = ("preload", "pressurize", "retract")
 MOVING = ("approach", "preload", "retract", "pull-off", "return")
 PROTOCOL = {**SHORT, "tare_s": 0.3, "preload_dwell_s": 0.5, "retract_speed_um_s": 200.0, "approach_speed_um_s": 200.0}
 START_MM = 22.5
+PATIENCE_MS = 1000.0
+"""Longer than the benches' time-outs: the computer of a test may be busy."""
 LATER = 100
 """Samples between the beginning of a step and the fault."""
 
@@ -116,13 +118,14 @@ def _links(device: str) -> Iterator[Trouble]:
             cut_off=(device,),
         )
         yield Trouble(f"{device} sends garbage{where}", words, (6,), ((device, "garbage", 0),), wire=wire, steps=steps)
-    yield Trouble(f"{device} slow: replies after 2 s", words, (6,), ((device, "slow", 2.0),), wire=True)
+    yield Trouble(f"{device} slow: replies after 4 s", words, (6,), ((device, "slow", 4.0),), wire=True)
     yield Trouble(f"{device} answers late (stale replies)", words, (6,), ((device, "late", 0),), wire=True)
 
 
 def cells(*, wire: bool | None = None) -> list[tuple[Trouble, str]]:
     """Return every cell; ``wire`` keeps those that are played over a wire, or those that are not."""
-    return [(trouble, step) for trouble in troubles() if wire in (None, bool(trouble.wire)) for step in trouble.steps]
+    rows = sorted(troubles(), key=lambda trouble: bool(trouble.wire))
+    return [(trouble, step) for trouble in rows if wire in (None, bool(trouble.wire)) for step in trouble.steps]
 
 
 def _press(number: signal.Signals, times: int) -> Callable[[Stage], None]:
@@ -206,8 +209,8 @@ def troubles() -> list[Trouble]:
         Trouble("DAQ overrun, on the wire", daq, (6,), (("daq", "overrun", 0),), wire=True, steps=REPEATED),
         Trouble("DAQ removed, on the wire", daq, (6,), (("daq", "removed", 0),), wire=True, steps=REPEATED),
         Trouble("DAQ server never answers, on the wire", daq, (6,), (("daq", "hang", 0),), wire=True, steps=REPEATED),
-        Trouble("force over range, compression", cell, (3, 6), (("force", "over_range", 3.5),)),
-        Trouble("force over range, tension", cell, (3, 6), (("force", "over_range", -3.5),)),
+        Trouble("force over range, compression", cell, (3, 6), (("force", "over_range", 4.7),)),
+        Trouble("force over range, tension", cell, (3, 6), (("force", "over_range", -4.7),)),
         Trouble("load cell's amplifier at its rail", cell, (3, 6), (("force", "open_wire", 0),)),
         Trouble("pressure wire open (a believable -330 mbar)", sensor, (3, 6), (("pressure", "open_wire", 0),)),
         Trouble("pressure sensor clipped high", sensor, (3, 6), (("pressure", "clipped", 1),)),
@@ -308,7 +311,12 @@ def request_of(out: Path, trouble: Trouble, step: str) -> Request:
     """Return the request of a cell."""
     text = scene_text("sphere-60mm-low", **PROTOCOL)
     bench, bench_text = load_bench(None)
-    bench = bench.model_copy(update={"stage": bench.stage.model_copy(update={"start_mm": START_MM})})
+    assert bench.pump is not None
+    parts = {
+        "stage": bench.stage.model_copy(update={"start_mm": START_MM, "reply_timeout_ms": PATIENCE_MS}),
+        "pump": bench.pump.model_copy(update={"reply_timeout_ms": PATIENCE_MS}),
+    }
+    bench = bench.model_copy(update=parts)
     script = [
         Fault(device, kind, at_step=step, after_samples=LATER, value=value) for device, kind, value in trouble.faults
     ]

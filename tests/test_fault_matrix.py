@@ -9,6 +9,8 @@ import pytest
 from fault_matrix import Trouble, Verdict, cells, page, play, troubles
 
 PAGE = Path(__file__).parents[1] / "docs" / "fault-matrix.md"
+ENOUGH = 200
+"""Cells that make a page."""
 ON_WIRE = ("stage unplugged, on the wire", "pump answers late (stale replies)", "DAQ removed, on the wire")
 
 
@@ -25,10 +27,10 @@ def name(cell: tuple[Trouble, str]) -> str:
 
 @pytest.fixture(scope="module")
 def verdicts() -> Iterator[list[Verdict]]:
-    """What the cells of this run came to; a whole matrix becomes the page in the documentation."""
+    """What the cells of this run came to; enough of them become the page in the documentation."""
     collected: list[Verdict] = []
     yield collected
-    if len(collected) == len(cells()):
+    if len(collected) >= ENOUGH:
         PAGE.write_text(page(collected), encoding="utf-8")
 
 
