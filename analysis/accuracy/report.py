@@ -7,6 +7,7 @@ import math
 import pkgutil
 import platform
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,13 +36,16 @@ def write_report(folder: Path, *, quick: bool, progress: Progress) -> Path:
     begin = time.perf_counter()
     parts: list[str] = []
     for name in studies():
-        module = importlib.import_module(f"analysis.accuracy.{name}")
-        for section in module.sections(quick, progress):
-            parts.append(_write_section(section, files))
+        parts += [_write_section(section, files) for section in _sections(name)(quick, progress)]
     page = folder / "accuracy.md"
     seconds = time.perf_counter() - begin
     page.write_text("\n".join([_heading(quick, seconds), *parts]), encoding="utf-8", newline="\n")
     return page
+
+
+def _sections(study: str) -> Callable[[bool, Progress], list[Section]]:
+    function: Callable[[bool, Progress], list[Section]] = importlib.import_module(f"analysis.accuracy.{study}").sections
+    return function
 
 
 def _heading(quick: bool, seconds: float) -> str:
