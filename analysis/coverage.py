@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -125,11 +125,16 @@ def deviations(kind: str, seeds: Iterable[int]) -> dict[str, list[float]]:
 
 
 def coverage(kind: str, seeds: Iterable[int]) -> pd.DataFrame:
+    """Return the summary of ``deviations``."""
+    return summary(deviations(kind, seeds))
+
+
+def summary(found: Mapping[str, list[float]]) -> pd.DataFrame:
     """Return, per feature: how many tests, share within one standard uncertainty, mean and spread of the deviations."""
     import pandas as pd
 
     rows = []
-    for name, listed in deviations(kind, seeds).items():
+    for name, listed in found.items():
         scores = np.array(listed)
         good = scores[np.isfinite(scores)]
         inside = float(np.mean(np.abs(good) < 1))

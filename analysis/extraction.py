@@ -235,3 +235,18 @@ def extract(run: Run, *, again: bool = False) -> Extraction:
             work.failed[step.name] = reason
             work.missing.update(dict.fromkeys(step.gives, reason))
     return work
+
+
+def markdown() -> str:
+    """Return every step with its decision and its features, as Markdown for the documentation."""
+    lines: list[str] = []
+    for step in ordered():
+        limits = f" ({', '.join(step.protocols)} only)" if step.protocols else ""
+        lines += [
+            f"### {step.title}{limits}",
+            "",
+            *(line.removeprefix("    ") for line in step.explanation.splitlines()),
+            "",
+        ]
+        lines += [*(f"- `{name}`: {text}" for name, text in step.gives.items()), ""] if step.gives else []
+    return "\n".join(lines)

@@ -147,13 +147,22 @@ def _sampling(work: Extraction) -> dict[str, float]:
     if "pull_off_distance_m" in values:
         speed = _speed(work, work.release)
         width = values.get("snap_duration_s", 1 / work.run.rate) * work.run.rate
-        found["pull_off_distance_m"] = speed * max(width, 1.0) / np.sqrt(12.0)
+        stage = np.hypot(_stage_noise(work, work.release), _stage_noise(work, work.zero))
+        found["pull_off_distance_m"] = float(np.hypot(speed * max(width, 1.0) / np.sqrt(12.0), stage))
     if "pull_off_force_N" in values:
         found["pull_off_force_N"] = values["sampling_bias_N"]
         found["retraction_at_pull_off_m"] = _speed(work, work.peak) * float(np.hypot(work.peak_shift, 12.0**-0.5))
     if "snap_duration_s" in values:
         found["snap_duration_s"] = np.sqrt(2 / 12.0) / work.run.rate
     return found
+
+
+def _stage_noise(work: Extraction, index: float) -> float:
+    """How far the stage's position scatters about a steady motion within half a second, m."""
+    reach = max(8, round(0.25 * work.run.rate))
+    part = work.run.height[max(0, int(index) - reach) : int(index) + reach]
+    places = np.arange(part.size, dtype=np.float64)
+    return float(np.std(part - np.polynomial.Polynomial.fit(places, part, 1)(places)))
 
 
 def _speed(work: Extraction, index: float) -> float:

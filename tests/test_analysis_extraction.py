@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from analysis import AnalysisError, FeatureMissing, Run, Sensors, Step, analyze
-from analysis.extraction import ordered
+from analysis.extraction import markdown, ordered
 from analysis.loading import CONTACT_METHODS
 from analysis.numerics import Noise, find_jumps, fit_around, on_grid
 from analysis.pipeline import lighten
@@ -282,3 +283,8 @@ def test_coloured_noise_is_measured_and_redrawn() -> None:
     assert noise.inflation == pytest.approx(np.sqrt(10), rel=0.15)
     drawn = noise.draw(50_000, generator)
     assert Noise.measure(drawn, 100).of_mean(100) == pytest.approx(noise.of_mean(100), rel=0.2)
+
+
+def test_documentation_lists_every_step_and_feature() -> None:
+    page = Path(__file__).parents[1] / "docs" / "analysis.md"
+    assert page.read_text(encoding="utf-8").endswith(markdown())
