@@ -10,6 +10,7 @@ import time
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.cone_branch import Branch, Point, settled_state
 from model.cone_error import of_features
@@ -21,6 +22,16 @@ from model.start import check, start_position, start_radius
 
 NODES = 64
 """Radii at which the branch is scanned for folds; the features themselves are solved to machine precision."""
+
+
+class Equilibria(NamedTuple):
+    """The whole branch of equilibria, unstable ones included, from r_i down to the apex; SI units."""
+
+    contact_radius: Array
+    position: Array
+    force: Array
+    stable: NDArray[np.bool_]
+    """Under displacement control: d2Pi/dr2 > 0."""
 
 
 DIGITS_LOST = 1e-10
@@ -118,6 +129,27 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         runtime_s=time.perf_counter() - begin,
         evaluations=cone.evaluations,
         warnings=_warnings(cone, height, errors["pull_off_force"] / -peak.force),
+    )
+
+
+def equilibria(parameters: Parameters, *, contact_stretch: bool = True, nodes: int = 200) -> Equilibria:
+    """Return the branch dPi/dr = 0 that ``solve`` follows, at ``nodes`` contact radii.
+
+    Raises
+    ------
+    InvalidParameter
+        A parameter lies outside its physical range.
+    NotConverged
+        The equilibrium could not be solved.
+    """
+    check(parameters)
+    cone, scales = nondimensional(parameters, contact_stretch)
+    branch = Branch(cone, nodes)
+    return Equilibria(
+        branch.radius * scales.length,
+        branch.position * scales.length,
+        branch.force * scales.force,
+        branch.climb <= 0,
     )
 
 

@@ -143,6 +143,16 @@ def test_branch_is_stable_exactly_where_its_height_falls_with_the_radius():
     assert ((second > 0) == (branch.climb[:-1] < 0)).all()
 
 
+@pytest.mark.parametrize("parameters", PAPERS, ids=str)
+def test_the_branch_beyond_detachment_is_unstable(parameters):
+    branch = cone.equilibria(parameters)
+    solved = cone.solve(parameters)
+    beyond = branch.contact_radius < solved.detachment_radius * (1 - 1e-9)
+    assert not branch.stable[beyond].any()
+    assert branch.stable[~beyond].all()
+    assert branch.position.max() <= solved.detachment_position * (1 + 1e-12)
+
+
 def test_a_branch_with_two_maxima_jumps_at_the_first():
     """A narrow suction-dominated contact: found by search, kept because it jumps."""
     source = random.Random(11)
