@@ -33,6 +33,7 @@ shape = "sphere"
 diameter_mm = 60.0
 [protocol]
 preload_N = 0.3
+approach_speed_um_s = 12.0
 retract_speed_um_s = 100.0
 preload_dwell_s = 1.0
 tare_s = 0.5
@@ -54,7 +55,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE)
     _, bench = load_bench(None)
-    patient = bench.replace("[limits]", "[limits]\nlag_s = 60.0")  # a busy machine is no fault of this test
+    patient = bench.replace("[limits]", "[limits]\nlag_s = 4.0")  # a busy machine is no fault of this test
+    patient = patient.replace("start_mm = 22.0", "start_mm = 20.1")
     (tmp_path / "bench.toml").write_text(patient)
     return tmp_path
 

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 from rig.bench import Bench, load_bench
 from rig.check import check
 from rig.errors import Refused, RigError
 from rig.library import find_scene
+from rig.protocols import build_steps
 from rig.scene import Scene, parse_scene
+
+if TYPE_CHECKING:
+    from sequences.step import Apparatus
 
 
 @dataclass(frozen=True)
 class Checked:
-    """A scene held against a bench: what was looked at, and why it was refused (empty when it was not)."""
+    """A scene held against a bench: what was looked at, why it was refused (empty when it was not), and its steps."""
 
     scene: Scene | None
     emulated: bool
     findings: tuple[str, ...]
     refusals: tuple[str, ...]
+    plan: tuple[str, ...] = ()
 
     @property
     def ready(self) -> bool:
@@ -38,7 +44,12 @@ def check_scene(name: str, bench_path: Path | None) -> Checked:
         check(scene, bench)
     except Refused as error:
         return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), _reasons(error))
-    return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), ())
+    return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), (), _plan(scene))
+
+
+def _plan(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the steps; planning touches no instrument, so none is given."""
+    return tuple(step.name for step in build_steps(scene, cast("Apparatus", None)))
 
 
 def _reasons(error: Refused) -> tuple[str, ...]:

@@ -185,9 +185,10 @@ class Readings(Card):
         for reading in (self.force, self.pressure, self.retraction):
             self.column.addWidget(reading)
 
-    def prepare(self, *, uses_pressure: bool) -> None:
+    def prepare(self, *, uses_pressure: bool, retracts: bool) -> None:
         """Show only what the scene uses."""
         self.pressure.setVisible(uses_pressure)
+        self.retraction.setVisible(retracts)
 
     def show_moment(self, moment: Moment) -> None:
         """Show the present values."""

@@ -332,7 +332,7 @@ class RetractionPlot(Plot):
         self.legend.setText(
             f"<span style='color:{theme.measured}'>\u2501\u2501 measured</span>&nbsp;&nbsp; "
             f"<span style='color:{theme.model}'>\u2578\u2578 model, 90 % band</span>&nbsp;&nbsp; "
-            f"<span style='color:{theme.model}'>\u00b7\u00b7\u00b7 as announced at P<sub>0</sub></span>"
+            f"<span style='color:{theme.model}'>\u00b7\u00b7\u00b7 at P<sub>0</sub></span>"
         )
 
     def expect(self, retraction: Array, values: Array) -> None:

@@ -238,12 +238,16 @@ class Console(QMainWindow):
         for plot in self.plots:
             plot.refollow()
 
-    def _use_pressure(self, used: bool) -> None:
+    def _use(self, *, pressure: bool, protocol: str, steps: list[str]) -> None:
         """Show nothing the scene does not use."""
-        self.pressure_time.widget.setVisible(used)
-        self.pressure_path.widget.setVisible(used)
-        self.pump.setVisible(used)
-        self.readings.prepare(uses_pressure=used)
+        retracts = "retract" in steps
+        self.force_path.widget.setVisible(retracts)
+        self.pressure_time.widget.setVisible(pressure)
+        self.pressure_path.widget.setVisible(pressure and retracts)
+        self.pump.setVisible(pressure)
+        self.readings.prepare(uses_pressure=pressure, retracts=retracts)
+        self.prediction.setVisible(protocol == "pull_off")
+        self.strip.plan(steps)
 
     # ------------------------------------------------------------ before a run
 
@@ -261,8 +265,10 @@ class Console(QMainWindow):
         self._say_fault("\n".join(checked.refusals))
         if checked.scene is not None:
             self.title.setText(checked.scene.title)
-            self._use_pressure(checked.scene.uses_pressure)
-            self._expect(checked)
+            name = checked.scene.protocol.name
+            self._use(pressure=checked.scene.uses_pressure, protocol=name, steps=list(checked.plan))
+            if name == "pull_off" and checked.scene.gripper.kind == "rigid":  # the papers model no other
+                self._expect(checked)
         self._set_state("checked: ready" if checked.ready else "refused", "good" if checked.ready else "fault")
         self._offer()
 
@@ -504,8 +510,8 @@ class Console(QMainWindow):
         self.playhead = Playhead(live=not self._replaying)
         self._set_speed(0)
         self.title.setText(info.title)
-        self._use_pressure(info.uses_pressure)
-        self.strip.plan([plan.name for plan in info.plan])
+        steps = [plan.name for plan in info.plan]
+        self._use(pressure=info.uses_pressure, protocol=info.protocol, steps=steps)
         self.stage.prepare(info)
         self.recording.prepare(info, replay=self._replaying)
         self.progress.setVisible(info.repeats > 1)
