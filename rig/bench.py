@@ -168,20 +168,25 @@ class Bench(Section):
 
 
 def load_bench(path: Path | None) -> tuple[Bench, str]:
-    """Read and check a bench file, or the emulated bench for ``None``; return it with its text.
+    """Read and check a bench file, one that ships by its name, or the emulated bench for ``None``.
+
+    Returns
+    -------
+    tuple
+        The bench and the file's text.
 
     Raises
     ------
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    if path is None:
-        from importlib.resources import files
+    from importlib.resources import files
 
-        text, source = files("benches").joinpath("emulated.toml").read_text("utf-8"), "benches/emulated.toml"
-    else:
-        text, source = read_text(path, "bench"), str(path)
-    return parse_bench(text, source), text
+    name = "emulated" if path is None else str(path)
+    shipped = files("benches").joinpath(f"{name}.toml")
+    by_name = path is None or (path.name == name and not path.suffix and not path.exists() and shipped.is_file())
+    text = shipped.read_text("utf-8") if by_name or path is None else read_text(path, "bench")
+    return parse_bench(text, f"benches/{name}.toml" if by_name else name), text
 
 
 def parse_bench(text: str, source: str) -> Bench:

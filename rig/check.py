@@ -6,7 +6,15 @@ from itertools import accumulate
 
 from rig.bench import Bench
 from rig.errors import Refused
-from rig.scene import ContactSection, DeadWeightsSection, LeakSection, PullOffSection, Scene, VolumeSection
+from rig.scene import (
+    ComplianceSection,
+    ContactSection,
+    DeadWeightsSection,
+    LeakSection,
+    PullOffSection,
+    Scene,
+    VolumeSection,
+)
 
 STOPPING_MARGIN = 1.5
 """Room for the frame that is under way when a limit is passed."""
@@ -14,9 +22,12 @@ STOPPING_MARGIN = 1.5
 RESOLUTION = 10.0
 """A preload is worth setting if it is so many times what the load cell is known to."""
 
-
 REACTION_S = 0.03
 """From the end of a frame to the stop byte at the stage: p99 on a loaded computer (docs/reliability.md)."""
+
+SLOW_UM_S = 20.0
+"""Slow enough to press a rigid stop with a load train whose compliance nobody knows yet."""
+
 OVERLOAD = 1.2
 """What a load cell survives, in capacities."""
 
@@ -29,8 +40,8 @@ def check(scene: Scene, bench: Bench) -> None:
     Refused
         Names every reason with value, limit and remedy.
     """
-    reasons = [*_instruments(scene, bench), *_forces(scene, bench), *_pressure(scene, bench), *_speeds(scene, bench)]
-    reasons += _overruns(scene, bench)
+    parts = (_instruments, _forces, _resolution, _tension, _pressure, _strokes, _speeds, _overruns)
+    reasons = [reason for part in parts for reason in part(scene, bench)]
     if reasons:
         raise Refused(f"scene {scene.title!r} cannot run on bench {bench.title!r}: " + "; ".join(reasons))
 
@@ -60,8 +71,8 @@ def _resolution(scene: Scene, bench: Bench) -> list[str]:
     if not isinstance(protocol, ContactSection) or protocol.preload_N >= RESOLUTION * known:
         return []
     return [
-        f"preload_N = {protocol.preload_N:g} is less than {RESOLUTION:g} times what the load cell {bench.force.cell} is "
-        f"known to (residual = {known:g} N); fit a smaller load cell and name its bench file "
+        f"preload_N = {protocol.preload_N:g} is less than {RESOLUTION:g} times what the load cell {bench.force.cell} "
+        f"is known to (residual = {known:g} N); fit a smaller load cell and name its bench file "
         "(emulated: --bench emulated-gso25)"
     ]
 
@@ -106,7 +117,7 @@ def _strokes(scene: Scene, bench: Bench) -> list[str]:
         return []
     pumped = list(accumulate(protocol.strokes_ml))
     reasons = []
-    reach = max(pumped + [0.0]) - min(pumped + [0.0])
+    reach = max(0.0, *pumped) - min(0.0, *pumped)
     if reach > 0.8 * bench.pump.syringe_volume_ml:
         available = 0.8 * bench.pump.syringe_volume_ml
         reasons.append(f"strokes_ml: they span {reach:g} ml, {available:g} ml of the syringe can be used; shorten them")
@@ -116,8 +127,8 @@ def _strokes(scene: Scene, bench: Bench) -> list[str]:
         pressure = atmosphere * amount / (volume - amount) if amount < volume else float("inf")
         if not low <= pressure <= high:
             reasons.append(
-                f"strokes_ml: {amount:+g} ml in the chamber make about {pressure:+.3g} kPa, the bench allows {low:g} to "
-                f"{high:g} kPa; shorten the strokes"
+                f"strokes_ml: {amount:+g} ml in the chamber make about {pressure:+.3g} kPa, the bench allows {low:g} "
+                f"to {high:g} kPa; shorten the strokes"
             )
     return reasons
 
@@ -164,10 +175,12 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
     if speed is None:
         return []
     compliance, overload = bench.force.compliance_um_per_N, OVERLOAD * bench.force.capacity_N
+    if compliance == 0.0 and isinstance(scene.protocol, ComplianceSection) and speed <= SLOW_UM_S:
+        return []  # this is how it becomes known
     if compliance == 0.0:
         return [
             "force.compliance_um_per_N of the bench is 0: nobody knows how fast the force rises on contact; "
-            "press a rigid stop and fit travel against force"
+            f"run the scene `compliance` at {SLOW_UM_S:g} um/s or less and enter its result"
         ]
     preload = getattr(scene.protocol, "preload_N", 0.0)
     reaction = bench.daq.frame_ms * 1e-3 + REACTION_S

@@ -97,6 +97,7 @@ class IndentationSection(ContactSection):
     retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 50.0
     contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 3.0
     indenter_radius_mm: Annotated[float, Field(gt=0, le=1000)] = 4.0
+    contact_area_mm2: Annotated[float, Field(gt=0)] | None = None
     positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
         "top",
         "center",
@@ -126,6 +127,7 @@ class PunchSection(ContactSection):
     """``[protocol]`` of the pull-off of fibres on a rigid punch (EML Fig. 3e)."""
 
     name: Literal["punch"]
+    contact_area_mm2: Annotated[float, Field(gt=0)] | None = None
 
 
 class VolumeSection(Section):
@@ -160,6 +162,8 @@ class DeadWeightsSection(Section):
 
     name: Literal["dead_weights"]
     masses_g: Annotated[tuple[float, ...], Field(min_length=2, strict=False)] = (0.0, 20.0, 50.0, 100.0, 200.0)
+    mass_tolerance_percent: Annotated[float, Field(ge=0, le=10)] = 0.05
+    gravity_m_s2: Annotated[float, Field(ge=9.7, le=9.9)] = 9.80665
     rest_s: Annotated[float, Field(ge=0.5, le=600)] = 2.0
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from model import ModelError, predict
-from rig.recording import load_run
+from rig.calibrate import calibrate
+from rig.recording import as_run, load_recording
 
 if TYPE_CHECKING:
     from analysis.pipeline import Analysis
+    from analysis.run import Run
     from model.prediction import Prediction
 
 _ROWS = (
@@ -22,13 +24,27 @@ _ROWS = (
     ("preload", "N", 1.0, "preload_N", None),
 )
 
+_STATEMENTS = ("Work of adhesion (S13)",)
+"""Steps of the analysis whose decision belongs to the result."""
+
 
 def summarise(path: Path, model: str = "cone") -> str:
-    """Analyse a recording, draw its picture beside it, and return the table of measurement and model."""
-    from analysis import analyze
-    from analysis.figures import overview
+    """Analyse a recording, draw its picture beside it, and return the table of measurement and model.
 
-    run = load_run(path)
+    A calibration gives the lines of the bench file instead, and writes them beside the recording too.
+    """
+    from analysis import analyze
+    from analysis.figures.fit_picture import save_fit
+
+    recording = load_recording(path)
+    picture = path.with_suffix(".png")
+    calibration = calibrate(recording)
+    if calibration is not None:
+        lines = path.with_suffix(".toml")
+        lines.write_text(calibration.toml, encoding="utf-8", newline="\n")
+        save_fit(calibration.picture, picture)
+        return f"{calibration}\nrecording  {path}\nlines      {lines}\npicture    {picture}"
+    run = as_run(recording)
     analysis = analyze(run)
     prediction: Prediction | None = None
     note = ""
@@ -38,10 +54,21 @@ def summarise(path: Path, model: str = "cone") -> str:
             prediction = predict(run.parameters, model)
         except ModelError as error:
             note = f"\nno prediction: {error}"
-    picture = path.with_suffix(".png")
-    overview(run, analysis, prediction, picture)
+    _draw(run, analysis, prediction, picture)
     table = _table(analysis, prediction) if run.protocol == "pull_off" else _list(analysis)
     return f"{table}{note}\nrecording  {path}\npicture    {picture}"
+
+
+def _draw(run: Run, analysis: Analysis, prediction: Prediction | None, picture: Path) -> None:
+    """Draw what the protocol is about: force and pressure of a test, the fit of a chamber's."""
+    from analysis.figures import overview
+    from analysis.figures.fit_picture import chamber_picture, save_fit
+
+    fit = chamber_picture(run, analysis)
+    if fit is not None:
+        save_fit(fit, picture)
+    else:
+        overview(run, analysis, prediction, picture)
 
 
 def _table(analysis: Analysis, prediction: Prediction | None) -> str:
@@ -63,5 +90,7 @@ def _table(analysis: Analysis, prediction: Prediction | None) -> str:
 
 
 def _list(analysis: Analysis) -> str:
-    """Return every feature found, a line each."""
-    return "\n".join(f"{name:<40}{quantity}" for name, quantity in analysis.features.items())
+    """Return every feature found, a line each, and how far the result can be trusted."""
+    lines = [f"{name:<40}{quantity}" for name, quantity in analysis.features.items()]
+    lines += [f"{title}: {why}" for title, why in analysis.decisions.items() if title in _STATEMENTS]
+    return "\n".join(lines)

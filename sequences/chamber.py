@@ -8,7 +8,6 @@ from sequences.frame import Frame
 from sequences.pressurize import Chamber, Pressurizer
 from sequences.step import Apparatus, Step, Steps, by_hand, rest
 
-
 CLOSE = "Open the chamber to the room, then close the gripper's mouth with the plate"
 
 

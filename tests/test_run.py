@@ -145,7 +145,7 @@ def test_force_over_the_limit_stops_the_stage_and_keeps_the_recording(request_fo
     with pytest.raises(Refused, match="preload_N"):
         run_scene(dataclasses.replace(request, bench=bench))
     request = request_for(
-        faults=Faults([Fault("force", "over_range", at_step="preload", after_samples=100, value=3.5)])
+        faults=Faults([Fault("force", "over_range", at_step="preload", after_samples=100, value=4.7)])
     )
     ending = run_scene(request)
     assert ending.exit_code == 3

@@ -72,15 +72,15 @@ def test_the_paper_rig_must_be_filled_in():
 def test_limits_beyond_the_load_cell_are_refused():
     _, text = load_bench(None)
     with pytest.raises(FileError, match="120 %"):
-        parse_bench(text.replace("tension_N = 3.0", "tension_N = 30.0"), "b.toml")
+        parse_bench(text.replace("tension_N = 4.4", "tension_N = 30.0"), "b.toml")
 
 
 def test_a_scene_the_bench_cannot_carry_out_is_refused():
     bench, _ = load_bench(None)
-    scene = parse_scene(SPHERE + "[protocol]\ninitial_pressure_kPa = -60.0\npreload_N = 2.5\n", "s.toml")
+    scene = parse_scene(SPHERE + "[protocol]\ninitial_pressure_kPa = -60.0\npreload_N = 3.5\n", "s.toml")
     with pytest.raises(Refused) as caught:
         check(scene, bench)
-    for word in ("initial_pressure_kPa = -60", "preload_N = 2.5", "-55"):
+    for word in ("initial_pressure_kPa = -60", "preload_N = 3.5", "-55"):
         assert word in str(caught.value)
 
 

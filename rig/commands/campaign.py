@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.campaign import Journal, PlannedTest
+    from rig.observe import Observer
+    from rig.operator import Keyboard
+    from rig.session import Request
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,9 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     todo = [test for test in tests if test.key not in done]
     found = f", {len(adopted)} of them found whole without an entry" if adopted else ""
     print(f"{campaign.title}: {len(tests)} tests, {len(tests) - len(todo)} done{found}", file=sys.stderr)
-    hands = not arguments.yes and not bench.is_emulated
-    with tqdm(total=len(todo), unit="test", disable=not sys.stderr.isatty()) as bar:
-        for code in _run_all(todo, bench, bench_text, journal, arguments, hands):
+    with tqdm(total=len(todo), unit="test", disable=not (sys.stderr.isatty() and bench.is_emulated)) as bar:
+        for code in _run_all(todo, bench, bench_text, journal, arguments):
             bar.update()
             if code:
                 return code
@@ -64,23 +66,20 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_all(
-    tests: list[PlannedTest],
-    bench: Bench,
-    bench_text: str,
-    journal: Journal,
-    arguments: argparse.Namespace,
-    hands: bool,
+    tests: list[PlannedTest], bench: Bench, bench_text: str, journal: Journal, arguments: argparse.Namespace
 ) -> Iterator[int]:
     """Run the tests one after another, or on the emulated bench several at once; yield exit codes as they come."""
     if arguments.jobs <= 1:
+        from rig.operator import Keyboard
+
+        keyboard = None if bench.is_emulated else Keyboard()
         setup = None
         for test in tests:
-            if hands and test.prompt and test.setup != setup:
-                input(f"{test.prompt} Press Enter to go on. ")
+            if keyboard is not None and not arguments.yes and test.prompt and test.setup != setup:
+                keyboard.confirm(test.prompt)
             setup = test.setup
-            yield _enter(
-                journal, test, *_run_one(test, bench, bench_text, journal.free_name(test.key), arguments.direct)
-            )
+            out = journal.free_name(test.key)
+            yield _enter(journal, test, *_run_one(test, bench, bench_text, out, arguments.direct, keyboard))
         return
     from concurrent.futures import ProcessPoolExecutor, as_completed
     from multiprocessing import get_context
@@ -94,7 +93,9 @@ def _run_all(
             yield _enter(journal, futures[future], *future.result())
 
 
-def _run_one(test: PlannedTest, bench: Bench, bench_text: str, out: Path, direct: bool) -> tuple[str, int, str]:
+def _run_one(
+    test: PlannedTest, bench: Bench, bench_text: str, out: Path, direct: bool, keyboard: Keyboard | None = None
+) -> tuple[str, int, str]:
     from rig.session import Request, run_scene
 
     request = Request(
@@ -110,8 +111,19 @@ def _run_one(test: PlannedTest, bench: Bench, bench_text: str, out: Path, direct
         repeats=test.repeats,
         place=test.place,
     )
+    request.observers = _observers(request, keyboard)
     ending = run_scene(request)
     return out.name, ending.exit_code, ending.reason
+
+
+def _observers(request: Request, keyboard: Keyboard | None) -> list[Observer]:
+    """On a real rig the operator sees every step and answers prompts; emulated, the progress bar is enough."""
+    if keyboard is None:
+        return []
+    from rig.operator import Prompts
+    from rig.terminal import Terminal
+
+    return [Terminal(), Prompts(keyboard, request.controls)]
 
 
 def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reason: str) -> int:

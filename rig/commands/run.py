@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rig.campaign import PlannedTest
     from rig.observe import Ending
+    from rig.operator import Keyboard
     from rig.session import Request
 
 DEFAULT_SCENE = "sphere-60mm-low"
@@ -37,13 +38,14 @@ def run(arguments: argparse.Namespace) -> int:
         from rig.commands import console
 
         return console.run_with_console(arguments)
-    import sys
+    from rig.operator import Keyboard
 
+    keyboard, place = Keyboard(), ""
     for test, request in _requests(arguments):
-        if test.place and not request.bench.is_emulated:
-            print(f"{test.prompt} Press Enter to go on.", file=sys.stderr)
-            sys.stdin.readline()
-        ending = _run_once(request, arguments)
+        if test.place != place and not request.bench.is_emulated:
+            keyboard.confirm(test.prompt)
+        place = test.place
+        ending = _run_once(request, arguments, keyboard)
         if ending.exit_code:
             return ending.exit_code
     return 0
@@ -114,13 +116,16 @@ def _destination(out: Path | None, key: str, count: int) -> Path:
     return out if count == 1 else out.with_name(f"{out.stem}-{key}{out.suffix}")
 
 
-def _run_once(request: Request, arguments: argparse.Namespace) -> Ending:
+def _run_once(request: Request, arguments: argparse.Namespace, keyboard: Keyboard) -> Ending:
     import sys
 
+    from rig.operator import Prompts
     from rig.session import run_scene
     from rig.terminal import Terminal
 
     observers: list[object] = [Terminal()]
+    if not request.bench.is_emulated:
+        observers.append(Prompts(keyboard, request.controls))
     if arguments.link:
         from rig.link import LinkServer
 
