@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.errors import NotConverged
+from model.errors import InvalidParameter, NotConverged
 from model.membrane_branch import Counter, Line, near_branch, pinned_state, release_branch
 from model.membrane_contact import Contact, ContactStretch, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
@@ -34,6 +34,10 @@ NARROWEST = 1e-7
 ORDERS = (12, 18, 27, 40)
 EXTRA_ORDER = 8
 """The error of the shape is the change of the features when the order rises by this."""
+HALVINGS = 12
+"""How often a panel may be halved: near slack states height and force turn within a narrow range."""
+MEASURED_TAIL = 1e-5
+MEASURED_HALVINGS = 3
 ACCEPTABLE = 1e-3
 """Relative error above which a result is refused instead of returned with its error."""
 
@@ -101,7 +105,7 @@ def solve(
     """
     began = time.perf_counter()
     check(parameters)
-    stretch = ContactStretch(contact_stretch)
+    stretch = _stretch(contact_stretch)
     assumptions = {
         "gas anchor": parameters.gas.anchor.value,
         "contact stretch": stretch.value,
@@ -122,6 +126,14 @@ def solve(
                 replace(scaled, annulus=anchored), prediction, points, tolerance, counter, memory or Memory()
             )
     return replace(prediction, runtime_s=time.perf_counter() - began, evaluations={"membrane states": counter.states})
+
+
+def _stretch(name: ContactStretch | str) -> ContactStretch:
+    try:
+        return ContactStretch(name)
+    except ValueError as error:
+        known = ", ".join(ContactStretch)
+        raise InvalidParameter(f"contact_stretch {name!r} is unknown; choose one of {known}") from error
 
 
 def scene(parameters: Parameters, stretch: ContactStretch, *, tension_field: bool = False) -> Scene:
@@ -195,7 +207,7 @@ def _solve(
         branch = near_branch(scaled.annulus, known, counter)
     if branch is None:
         branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter)
-    if branch is None or not _rises_above_start(scaled, branch):
+    if branch is None or branch.coordinate.size == 1 or not _rises_above_start(scaled, branch):
         return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
     memory.branch = branch
     found = _refined(scaled, branch, tolerance, counter, memory)
@@ -213,7 +225,7 @@ def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter, me
     """Raise the order of the shape until the features stand still."""
     relative = math.inf
     for order in ORDERS:
-        resolution = Resolution(order, 0.1 * tolerance)
+        resolution = _resolution(scaled, order, tolerance)
         peel = peel_panels(scaled.annulus, branch, scaled.start, resolution, counter)
         begins_pinned = peel[0].coordinate[0] == scaled.width
         pinned = []
@@ -230,6 +242,13 @@ def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter, me
     if lost > ACCEPTABLE:
         raise NotConverged(f"membrane: F_p or the detachment is uncertain by {lost:.1e} at the highest order")
     return found
+
+
+def _resolution(scaled: Scene, order: int, tolerance: float) -> Resolution:
+    """Return what a panel must reach; a measured pressure has a kink at every sample, which no series resolves."""
+    if scaled.annulus.gas.measured is not None:
+        return Resolution(order, max(0.1 * tolerance, MEASURED_TAIL), MEASURED_HALVINGS)
+    return Resolution(order, 0.1 * tolerance, HALVINGS)
 
 
 def _errors(scaled: Scene, read: Features, counter: Counter) -> Errors:

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 STEP_TOLERANCE = 1e-8
 """Newton's last step; convergence is quadratic, so that the state after it is exact to rounding."""
+LONGEST_STEP = 0.5
+"""Largest relative change of the shape in one step; the pressure follows the shape and is not limited."""
 ROUNDING = 1e-5
 """Steps below this that no longer shrink are rounding, which small strains and high orders amplify."""
 
@@ -313,7 +315,7 @@ def solve(
     *,
     closure: Closure = Closure.RELEASE,
     target: Array | float = 0.0,
-    iterations: int = 12,
+    iterations: int = 25,
 ) -> Solved:
     """Solve n states at once by Newton's method from their guesses (n, m)."""
     targets = np.broadcast_to(np.asarray(target, dtype=float), width.shape)
@@ -331,7 +333,7 @@ def solve(
         active, part, residual, jacobian = active[usable], part[usable], residual[usable], jacobian[usable]
         step = _newton_step(jacobian, residual)
         size = relative_size(part, step, width[active])
-        fraction = np.minimum(1.0, 0.5 / np.maximum(size, 1e-300))
+        fraction = np.minimum(1.0, LONGEST_STEP / np.maximum(_change_of_shape(part, step, width[active]), 1e-300))
         state[active] = part + fraction[:, None] * step
         done = (size < STEP_TOLERANCE) | ((size < ROUNDING) & (size > 0.1 * before[active]))
         before[active] = size
@@ -373,15 +375,25 @@ def release_slope(annulus: Annulus, width: Array, state: Array) -> Array:
 
 def relative_size(state: Array, step: Array, width: Array) -> Array:
     """Return the largest change of strain, tension or pressure in each row, in units of what the row holds."""
+    tension = _largest_tension(state)
+    pressure = np.abs(step[:, -2]) / np.maximum(tension, np.abs(state[:, -2]))
+    return np.maximum(_change_of_shape(state, step, width), pressure)
+
+
+def _largest_tension(state: Array) -> Array:
     order = state.shape[1] // 2 - 2
-    u, rest = slice(0, order + 1), slice(order + 1, None)
-    tension = np.maximum(np.abs(state[:, order + 1 : -2]).max(axis=1), np.abs(state[:, -1])) + 1e-300
+    return np.asarray(np.maximum(np.abs(state[:, order + 1 : -2]).max(axis=1), np.abs(state[:, -1])) + 1e-300)
+
+
+def _change_of_shape(state: Array, step: Array, width: Array) -> Array:
+    """Return the largest relative change of strain or tension in each row."""
+    order = state.shape[1] // 2 - 2
+    tension = _largest_tension(state)
     strain = tension / (4 + tension)  # w_1 = 4 strain for small strains
     R = np.exp(-width[:, None] * (1 - node_positions(order)))
-    displacement = (np.abs(step[:, u]) / R).max(axis=1) / (np.minimum(width, 1) * strain)
-    load = np.maximum(tension, np.abs(state[:, -2]))
-    largest: Array = np.maximum(displacement, np.abs(step[:, rest]).max(axis=1) / load)
-    return largest
+    displacement = (np.abs(step[:, : order + 1]) / R).max(axis=1) / (np.minimum(width, 1) * strain)
+    pulled = np.maximum(np.abs(step[:, order + 1 : -2]).max(axis=1), np.abs(step[:, -1])) / tension
+    return np.asarray(np.maximum(displacement, pulled))
 
 
 def strip(work: float, order: int) -> Array:

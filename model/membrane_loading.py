@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from model.errors import NotConverged
 from model.membrane_branch import Counter, follow
-from model.membrane_contact import Frozen, Line, Surface, flat_line
+from model.membrane_contact import ContactStretch, Frozen, Line, Surface, flat_line, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, node_positions, relative_size, resample, solve
 from model.membrane_material import energy, respond
 
@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 ORDER = 14
 POINTS = 18
 ITERATIONS = 60
+FLATTEST = 1e-3
+"""Slope at the widest contact below which the strains of loading, its square, are lost in rounding."""
 EXCESS_DEGREE = 9
 RELAXATION = 0.5
 """Share of the new radii in each iteration: a wider ring is stretched less, so that full steps would alternate."""
@@ -44,8 +46,8 @@ def loading_contact(surface: Surface, width: float) -> Frozen:
     NotConverged
         No loading state was found, or the frozen radii did not settle.
     """
-    if surface.curvature == 0:
-        return Frozen(lambda _, a: flat_line(a))
+    if surface.curvature * np.exp(-width) < FLATTEST:
+        return frozen(ContactStretch.PROJECTED)
     counter = Counter()
     widest = float(np.exp(-width))
     places = widest * (SMALLEST + (1 - SMALLEST) * node_positions(POINTS))

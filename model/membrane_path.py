@@ -20,8 +20,6 @@ PANEL_SIZES = (16, 32)
 """Points of a panel, less one. A panel that the larger number does not resolve is halved."""
 SHORTEST = 1e-9
 """Rise of a pinned part, relative to the heights it lies between, below which it is left out."""
-DEEPEST = 12
-"""How often a panel may be halved: near slack states height and force turn within a narrow range."""
 
 
 class Panel(NamedTuple):
@@ -110,10 +108,11 @@ class Memory:
 
 
 class Resolution(NamedTuple):
-    """How well a line is to be resolved: order of the shapes, relative size of the last terms of the series."""
+    """How well to resolve a line: order of the shapes, relative last terms of the series, halvings of a panel."""
 
     order: int
     tail: float
+    deepest: int
 
 
 def peel_panels(annulus: Annulus, branch: Line, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
@@ -122,7 +121,7 @@ def peel_panels(annulus: Annulus, branch: Line, floor: float, resolution: Resolu
     first = max(int(np.argmax(heights > floor)) - 1, 0)
     last = min(int(np.argmax(heights)) + 1, heights.size - 1)
     ends = float(branch.coordinate[first]), float(branch.coordinate[last])
-    return _panels(annulus, branch, ends, None, resolution, counter, DEEPEST)
+    return _panels(annulus, branch, ends, None, resolution, counter, resolution.deepest)
 
 
 def pinned_panels(
@@ -147,7 +146,7 @@ def pinned_panels(
         panel
         for line in lines
         if line.coordinate.size > 1
-        for panel in _panels(annulus, line, _ends(line), width, resolution, counter, DEEPEST // 3)
+        for panel in _panels(annulus, line, _ends(line), width, resolution, counter, resolution.deepest // 3)
     ]
 
 
