@@ -135,7 +135,7 @@ def fit_leak(time: Array, pressure: Array, volume: float, atmosphere: float = ST
     title="Leak",
     protocols=("leak",),
     gives={
-        "leak_rate_Pa_s": "fall of the pressure per second at the start of the hold, positive towards the room",
+        "leak_rate_Pa_s": "speed at which P_a nears the room's pressure at the start of the hold",
         "leak_time_constant_s": "time in which the pressure falls to 1/e",
         "leak_flow_m3_s": "the same as volume flow at room pressure",
     },
@@ -153,5 +153,5 @@ def leak(work: Extraction) -> Details:
     time, gas = (block_means(signal[step.start : step.stop], length) for signal in (run.time, run.pressure))
     gas_parameters = run.parameters.gas
     found = fit_leak(time, gas, run.parameters.gripper.chamber_volume, gas_parameters.atmospheric_pressure)
-    work.set(leak_rate_Pa_s=found.rate, leak_time_constant_s=found.time_constant, leak_flow_m3_s=found.flow)
+    work.set(leak_rate_Pa_s=abs(found.rate), leak_time_constant_s=found.time_constant, leak_flow_m3_s=abs(found.flow))
     return {"decision": f"tau = {found.time_constant:.3g} s", "leak": found}

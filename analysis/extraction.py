@@ -132,6 +132,9 @@ class ExtractionStep:
         return (self.function.__doc__ or "").strip()
 
 
+CONTACT_TESTS = ("pull_off", "indentation", "fiber", "punch")
+"""Protocols that touch a sample and pull it off."""
+
 STEPS: dict[str, ExtractionStep] = {}
 """Registered steps by name; ``ordered`` puts them in the order they run."""
 

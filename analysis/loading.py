@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from analysis.errors import FeatureMissing
-from analysis.extraction import Details, Extraction, extraction_step
+from analysis.extraction import CONTACT_TESTS, Details, Extraction, extraction_step
 from analysis.numerics import Array, Noise, fit_around, on_grid, running_mean
 
 ContactMethod = Callable[[Array, Array, float], int]
@@ -111,6 +111,7 @@ def cumulative_sum(depth: Array, force: Array, sigma: float) -> int:
 @extraction_step(
     "contact",
     title="Contact point",
+    protocols=CONTACT_TESTS,
     after=("compliance",),
     gives={
         "contact_height_m": "separation at contact: median of the contact-point methods",
@@ -159,6 +160,7 @@ def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
 @extraction_step(
     "preload",
     title="Preload and relaxation",
+    protocols=CONTACT_TESTS,
     after=("compliance",),
     gives={
         "preload_N": "largest compressive force before the retraction",

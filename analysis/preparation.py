@@ -117,7 +117,7 @@ def tare(work: Extraction) -> Details:
     work.set(force_noise_N=work.noise.sigma, force_drift_N_s=float(work.baseline.deriv()(0.0)) * run.rate)
     if after is not None:
         work.set(baseline_residual_N=float(work.force[slice(*after)].mean()))
-    else:
+    elif work.windows.retraction is not None:
         work.missing["baseline_residual_N"] = "the recording holds no force-free part after detachment"
     how = "before contact and after detachment" if after is not None else "before contact only"
     return {"decision": f"line through {how}", "windows": windows, "baseline": work.baseline, "contact": contact}

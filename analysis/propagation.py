@@ -31,7 +31,8 @@ def budget(work: Extraction) -> dict[str, dict[str, float]]:
             if name in parts:
                 _add(parts[name], source, value - work.values[name])
     for name, spread in _noise(work).items():
-        _add(parts[name], "noise", spread)
+        if not name.endswith("_count"):
+            _add(parts[name], "noise", spread)
     for name, sources in _sampling(work).items():
         _add(parts[name], "sampling", sources)
     for name, uncertainty in work.stated.items():

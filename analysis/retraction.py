@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.errors import FeatureMissing
-from analysis.extraction import Details, Extraction, extraction_step
+from analysis.extraction import CONTACT_TESTS, Details, Extraction, extraction_step
 from analysis.numerics import Array, LocalFit, Noise, find_jumps, fit_around, fit_window, running_mean
 from analysis.preparation import SMOOTHING, require_adhesion
 
@@ -13,6 +13,7 @@ from analysis.preparation import SMOOTHING, require_adhesion
 @extraction_step(
     "zero crossing",
     title="Zero of force and of z_r",
+    protocols=CONTACT_TESTS,
     after=("compliance",),
     gives={
         "zero_force_height_m": "separation where F_r passes from compression to tension: z_r = 0",
@@ -71,6 +72,7 @@ def _slope(signal: Array, index: int, reach: int) -> float:
 @extraction_step(
     "jumps",
     title="Jumps",
+    protocols=CONTACT_TESTS,
     after=("zero crossing",),
     gives={
         "jumps_count": "sudden changes of force in the retraction, detachment included",
@@ -99,6 +101,7 @@ def jumps(work: Extraction) -> Details:
 @extraction_step(
     "detachment",
     title="Detachment and D_p",
+    protocols=CONTACT_TESTS,
     after=("jumps",),
     gives={
         "pull_off_distance_m": "D_p: separation at full detachment minus that at the zero of force",
@@ -107,26 +110,21 @@ def jumps(work: Extraction) -> Details:
     },
 )
 def detachment(work: Extraction) -> Details:
-    """Detachment is the last jump that releases the tension for good; half-way through it.
+    """Detachment is the last jump that leaves less than a quarter of the tension to what is left in the end; half-way.
 
     Without such a jump: where the tension, fitted by a line over its last part, falls below four standard deviations
     of a 20 ms mean. The separation is the stage's height then, corrected by the compliance for the force just before.
     """
-    start, stop = work.retraction()
+    start, _ = work.retraction()
     width = max(4, round(SMOOTHING * work.run.rate))
     noise = work.noise.of_mean(width)
     smooth = running_mean(work.force[start : work.windows.end], width)
-    tension = -float(smooth[: stop - start].min())
     if work.detached is None:
         raise FeatureMissing("still attached at the end of the recording")
-    band = max(5 * noise, 0.04 * tension)
-    releases = [
-        j
-        for j in work.jumps
-        if j.size > 0 and float(smooth[min(j.stop + 2 * width - start, smooth.size - 1) :].min()) > -band
-    ]
+    tail = float(np.median(work.force[work.detached + (work.windows.end - work.detached) // 2 :]))
+    releases = [j for j in work.jumps if j.size > 0 and tail - j.after < 0.25 * (tail - j.before)]
     if releases:
-        jump = releases[0]
+        jump = releases[-1]
         work.release = jump.middle
         before = jump.before
         work.set(snap_force_N=-before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
@@ -145,6 +143,7 @@ def detachment(work: Extraction) -> Details:
 @extraction_step(
     "pull-off",
     title="Pull-off force",
+    protocols=CONTACT_TESTS,
     after=("jumps",),
     gives={
         "pull_off_force_N": "F_p: largest tension, a magnitude",
@@ -206,6 +205,7 @@ def _side_of_jump(work: Extraction, index: int, left: int, right: int) -> tuple[
 @extraction_step(
     "energy",
     title="Energies",
+    protocols=CONTACT_TESTS,
     after=("detachment", "pull-off"),
     gives={
         "adhesion_energy_J": "work of the tension from z_r = 0 to detachment",
@@ -239,6 +239,7 @@ def _work(work: Extraction, first: int, last: int) -> float:
 @extraction_step(
     "hysteresis",
     title="Hysteresis loop",
+    protocols=CONTACT_TESTS,
     after=("energy",),
     gives={"hysteresis_energy_J": "work done on the sample in the whole cycle, contact to detachment"},
 )
@@ -257,6 +258,7 @@ def hysteresis(work: Extraction) -> Details:
 @extraction_step(
     "pressure",
     title="Pressure",
+    protocols=("pull_off",),
     after=("segments",),
     uses=("pull-off", "detachment"),
     gives={
@@ -296,6 +298,7 @@ def _before(signal: Array, index: int, half: int) -> float:
 @extraction_step(
     "gas work",
     title="Work of the gas",
+    protocols=("pull_off",),
     after=("pressure",),
     gives={
         "pump_work_J": "work of the pump on the gas while P_0 is set, p dV",
@@ -332,6 +335,7 @@ def gas_work(work: Extraction) -> Details:
 @extraction_step(
     "stress",
     title="Stress",
+    protocols=("pull_off", "punch"),
     after=("pull-off",),
     gives={"adhesion_stress_Pa": "F_p over the full contact pi r_e^2 (large spheres and flats)"},
 )
