@@ -70,7 +70,7 @@ class Doubt:
     work_of_adhesion: float = 0.25
     gas: float = 300.0
     force_shape: float = 0.13
-    pressure_shape: float = 60.0
+    pressure_shape: float = 150.0
     correlation: float = 0.4
     rough: float = 0.3
     rough_correlation: float = 0.08
@@ -82,10 +82,14 @@ class Doubt:
 
 @dataclass(frozen=True, slots=True)
 class Mend:
-    """How the exact membrane differs from the cone: factors on the way from onset to detachment and on the force."""
+    """How the exact membrane differs from the cone.
+
+    Factors on the way from onset to detachment, on the force, and on the change of the pressure on that way.
+    """
 
     distance: float = 1.0
     force: float = 1.0
+    pressure: float = 1.0
     known: bool = False
 
 
@@ -159,7 +163,11 @@ def mend(parameters: Parameters) -> Mend:
     exact_way = exact.detachment_position - cone.onset_position
     if not way > 0 or not 0.1 < exact_way / way < 3:
         return Mend()
-    return Mend(exact_way / way, exact.pull_off_force / cone.pull_off_force, known=True)
+    before = float(np.interp(cone.onset_position, cone.position, cone.pressure))
+    change, exact_change = float(cone.pressure[-1]) - before, float(exact.pressure[-1]) - before
+    pressure = exact_change / change if abs(change) > 10.0 else 1.0
+    force = exact.pull_off_force / cone.pull_off_force
+    return Mend(float(exact_way / way), float(force), min(max(pressure, 0.0), 2.0), known=True)
 
 
 STEPS = {"apex": 2e-6, "force_zero": 1e-4, "stiffness": 1e-3, "work": 1e-3, "gas": 5.0}
@@ -204,12 +212,14 @@ class Estimator:
         beyond = np.maximum(found.position - onset, 0.0)
         position = np.minimum(found.position, onset) + stretched * beyond
         force = found.force * (1 + (mended - 1) * np.minimum(beyond / (0.3 * max(beyond[-1], 1e-9)), 1.0))
+        before = float(np.interp(onset, found.position, found.pressure))
+        change = np.where(beyond > 0, found.pressure - before, 0.0)
         zero = found.zero_force_position
         zero = zero if zero <= onset else onset + stretched * (zero - onset)
         return Curves(
             height=position + values["apex"] - self._compliance * force,
             force=force,
-            pressure=found.pressure,
+            pressure=found.pressure + (self.mend.pressure - 1) * change,
             zero_height=zero + values["apex"],
             pull_off_force=float(-force.min()),
             prediction=found,

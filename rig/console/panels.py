@@ -267,14 +267,15 @@ def _interval(symbol: str, estimate: Estimate | None, scale: float, unit: str) -
 def _at_start(first: LivePrediction) -> str:
     force, distance = first.pull_off_force, first.pull_off_distance
     return (
-        f"at P\u2080: F<sub>p</sub> {number(force.low, 2)} to {number(force.high, 2)} N, "
-        f"D<sub>p</sub> {number(distance.low * 1e3, 2)} to {number(distance.high * 1e3, 2)} mm"
+        "<span style='font-size:13px'>announced at P\u2080: "
+        f"F<sub>p</sub> {number(force.low, 2)}\u2013{number(force.high, 2)} N, "
+        f"D<sub>p</sub> {number(distance.low * 1e3, 2)}\u2013{number(distance.high * 1e3, 2)} mm</span>"
     )
 
 
 def _measured(force: float, distance: float) -> str:
     return (
-        "<span style='font-size:18px'><b>measured "
+        "<span style='font-size:15px'><b>measured "
         f"F<sub>p</sub> {number(force, 3)} N, D<sub>p</sub> {number(distance * 1e3, 3)} mm</b></span>"
     )
 
