@@ -342,7 +342,7 @@ def _jumps(scaled: Scene, pieces: list[Piece]) -> tuple[Jump, ...]:
     jumps = []
     for before, after in pairwise(pieces):
         left, right = Place(before, before.end), Place(after, after.begin)
-        if abs(left.width - right.width) <= 1e-9:
+        if not _leaps(left, right):
             continue
         jumps.append(
             Jump(
@@ -356,12 +356,20 @@ def _jumps(scaled: Scene, pieces: list[Piece]) -> tuple[Jump, ...]:
     return tuple(jumps)
 
 
+def _leaps(left: Place, right: Place) -> bool:
+    """Whether the contact line jumps between the end of a piece and the beginning of the next."""
+    return abs(left.width - right.width) > 1e-9
+
+
 def _profile(scaled: Scene, pieces: list[Piece], points: int) -> Mapping[str, Array]:
     """Sample the path, points shared among its pieces by the height they rise."""
     columns: dict[str, list[Array]] = {"position": [], "force": [], "pressure": [], "radius": []}
+    last: Place | None = None
     for piece, count in zip(pieces, _shares(pieces, points), strict=True):
         panel = piece.panel
-        at = np.linspace(piece.begin, piece.end, count)
+        joined = last is not None and not _leaps(last, Place(piece, piece.begin))  # its first point is there already
+        at = np.linspace(piece.begin, piece.end, count + joined)[int(joined) :]
+        last = Place(piece, piece.end)
         columns["position"].append(panel.height(at) * scaled.length)
         columns["force"].append(-2 * math.pi * scaled.force * panel.pull(at))
         columns["pressure"].append(scaled.pressure * panel.pressure(at))
