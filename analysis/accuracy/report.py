@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from analysis.accuracy.section import Progress, Section
+from model.errors import InvalidParameter
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,20 +27,33 @@ def studies() -> list[str]:
     return sorted(name for _, name, _ in pkgutil.iter_modules(analysis.accuracy.__path__) if name.endswith("_study"))
 
 
-def write_report(folder: Path, *, quick: bool, progress: Progress) -> Path:
-    """Run all studies; write ``accuracy.md`` into ``folder`` and pictures and CSV into its subfolder.
+def write_report(folder: Path, *, quick: bool, progress: Progress, only: str | None = None) -> Path:
+    """Run the studies; write ``accuracy.md`` into ``folder`` and pictures and CSV into its subfolder.
 
-    ``quick`` runs the reduced form: smaller grids, fewer random scenes, fewer repeats.
+    ``quick`` runs the reduced form: smaller grids, fewer random scenes, fewer repeats. ``only`` renews one study
+    (``cone`` for ``cone_study``) and keeps the parts of the others as they were written before.
+
+    Raises
+    ------
+    InvalidParameter
+        There is no such study.
     """
     files = folder / FOLDER
     files.mkdir(parents=True, exist_ok=True)
-    begin = time.perf_counter()
-    parts: list[str] = []
-    for name in studies():
-        parts += [_write_section(section, files) for section in _sections(name)(quick, progress)]
+    names = studies()
+    if only is not None and f"{only}_study" not in names:
+        known = ", ".join(name.removesuffix("_study") for name in names)
+        raise InvalidParameter(f"no study {only!r}; choose one of {known}")
+    for name in names:
+        if only is None or name == f"{only}_study":
+            begin = time.perf_counter()
+            parts = [_write_section(section, files) for section in _sections(name)(quick, progress)]
+            note = _conditions(name, quick, time.perf_counter() - begin)
+            (files / f"{name}.md").write_text("\n".join([*parts, note]), encoding="utf-8", newline="\n")
     page = folder / "accuracy.md"
-    seconds = time.perf_counter() - begin
-    page.write_text("\n".join([_heading(quick, seconds), *parts]), encoding="utf-8", newline="\n")
+    fragments = [files / f"{name}.md" for name in names]
+    written = [fragment.read_text(encoding="utf-8") for fragment in fragments if fragment.exists()]
+    page.write_text("\n".join([HEADING, *written]), encoding="utf-8", newline="\n")
     return page
 
 
@@ -48,22 +62,24 @@ def _sections(study: str) -> Callable[[bool, Progress], list[Section]]:
     return function
 
 
-def _heading(quick: bool, seconds: float) -> str:
+HEADING = """# Error against run time
+
+Written by `rig accuracy`. Errors are relative to an independent solution in high precision unless said otherwise; run
+times are those of warm repeats in one process (seconds of its CPU), so only their ratios travel.
+"""
+
+
+def _conditions(study: str, quick: bool, seconds: float) -> str:
+    """Return what the numbers of a study were made with."""
     import mpmath
     import numpy as np
     import scipy
 
     form = "reduced" if quick else "full"
-    versions = (
-        f"Python {platform.python_version()}, NumPy {np.__version__}, SciPy {scipy.__version__}, "
-        f"mpmath {mpmath.__version__}"
-    )
     return (
-        "# Error against run time\n\n"
-        f"Written by `rig accuracy{' --quick' if quick else ''}` ({form} form, {seconds:.0f} s) with {versions} on "
-        f"{platform.machine()}, {platform.system()}. Errors are relative to an independent solution in high precision "
-        "unless said otherwise; run times are medians of warm repeats in one process (seconds of its CPU), so only "
-        "their ratios travel.\n"
+        f"*{study.removesuffix('_study')}: {form} form, {seconds:.0f} s; Python {platform.python_version()}, "
+        f"NumPy {np.__version__}, SciPy {scipy.__version__}, mpmath {mpmath.__version__}, {platform.machine()}, "
+        f"{platform.system()}.*\n"
     )
 
 

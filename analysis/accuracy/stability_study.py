@@ -141,7 +141,7 @@ def _matrix(quick: bool, progress: Progress) -> Section:
     """One parameter at a time from end to end of its range, each scene against the reference."""
     import pandas as pd
 
-    count = 2 if quick else 13
+    count = 2 if quick else 5
     rows = []
     for name in ("d_b", "E_m", "h_0", "omega_a", "P_0", "V_0"):
         span = np.linspace(*PRESSURE, count) if name == "P_0" else np.geomspace(*RANGES[name], count)
@@ -198,7 +198,7 @@ def _random(quick: bool, progress: Progress) -> Section:
     """Random extreme scenes: outcomes, refusals checked, errors against their estimates."""
     import pandas as pd
 
-    count, compared = (300, 6) if quick else (10_000, 200)
+    count, compared = (300, 6) if quick else (10_000, 40)
     source = random.Random(2017)
     outcomes: Counter[str] = Counter()
     wrong = 0
@@ -207,7 +207,7 @@ def _random(quick: bool, progress: Progress) -> Section:
             progress(f"random extreme scene {k} of {count}")
         scene = random_scene(source)
         try:
-            solved = cone.solve(scene, contact_stretch=source.random() < 0.7, points=32)
+            solved = cone.solve(scene, contact_stretch=source.random() < 0.7, points=16)
         except ModelError as error:
             outcomes[type(error).__name__] += 1
             continue
@@ -272,7 +272,8 @@ def never_tensile(scene: Parameters, contact_stretch: bool) -> bool:
     march = reference.March(scene, contact_stretch)
     z, r = march.path()
     force = march.force(r, z)
-    return not bool((force[np.isfinite(force)] < -1e-9 * np.nanmax(np.abs(force), initial=0.0)).any())
+    rounding = 1e-12 * scene.membrane.youngs_modulus * scene.membrane.thickness * scene.gripper.radius
+    return not bool((force[np.isfinite(force)] < -rounding).any())
 
 
 def _conditions(progress: Progress) -> Section:
