@@ -358,6 +358,8 @@ def _draw_indentation(axes: Axes, analysis: Analysis, series: Series) -> None:
     series.add(analysis.run.name, "measured", displacement_m=depth, force_N=force)
     if "detachment" not in work.details:
         return
+    deepest, last = float(depth.max()) * 1e3, (origin - work.release_separation) * 1e3
+    axes.set_xlim(min(2.0 * last, -0.5 * deepest), 1.1 * deepest)
     part = slice(start, int(work.release))
     fits = fit_contact(work.separation[part], work.force[part], indenter_radius(analysis.run))
     for fit, color, style in zip(fits, (ORANGE, GREEN, PURPLE), ("--", ":", "-."), strict=True):
