@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 
 from model.errors import InvalidParameter, NotConverged
@@ -60,6 +61,8 @@ class Errors(NamedTuple):
     force: float
     zero: float
     detachment: float
+    peak_height: float
+    detachment_radius: float
 
 
 class Found(NamedTuple):
@@ -258,7 +261,24 @@ def _errors(scaled: Scene, read: Features, counter: Counter) -> Errors:
     detachment, _ = _change(annulus, read.detachment, counter)
     force += read.peak.piece.panel.tail * abs(read.peak.pull)
     detachment += read.detachment.piece.panel.tail * abs(read.detachment.height - read.start.height)
-    return Errors(force, _zero_error(scaled, read, counter), detachment)
+    return Errors(
+        force,
+        _zero_error(scaled, read, counter),
+        detachment,
+        peak_height=_drift(read.peak, read.peak.piece.panel.pull, read.peak.piece.panel.height),
+        detachment_radius=_drift(
+            read.detachment, read.detachment.piece.panel.height, read.detachment.piece.panel.radius
+        ),
+    )
+
+
+def _drift(place: Place, extreme: Chebyshev, read: Chebyshev) -> float:
+    """Return how far a quantity read at an extreme moves with the place of the extreme, as uncertain as its series."""
+    low, high = extreme.domain
+    noise = place.piece.panel.tail * float(np.abs(extreme.coef).max())
+    curvature = abs(float(extreme.deriv(2)(place.coordinate)))
+    shift = 2 * noise * len(extreme.coef) ** 2 / (high - low) / curvature if curvature else math.inf
+    return min(shift, float(high - low)) * abs(float(read.deriv()(place.coordinate)))
 
 
 def _zero_error(scaled: Scene, read: Features, counter: Counter) -> float:
@@ -325,7 +345,10 @@ def _prediction(scaled: Scene, found: Found, empty: Prediction, points: int) -> 
             "pull_off_force": newton * errors.force,
             "pull_off_distance": length * (errors.zero + errors.detachment),
             "zero_force_position": length * errors.zero,
+            "retraction_at_pull_off": length * (errors.zero + errors.peak_height),
             "detachment_position": length * errors.detachment,
+            "detachment_radius": length * errors.detachment_radius,
+            "adhesion_energy": newton * length * (errors.force * read.travel + abs(read.peak.pull) * errors.detachment),
         },
         warnings=tuple(_warnings(scaled, pieces) + _doubts(read, errors)),
     )
