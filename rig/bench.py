@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from rig.errors import FileError
-from rig.scene import Section, read_text
+from rig.scene import Section, Title, read_text
 from rig.validation import explain
 
 EMULATED = "emulated"
@@ -130,7 +130,7 @@ class LimitsSection(Section):
 class Bench(Section):
     """A whole bench file. Pump and pressure are needed by scenes with pressure only."""
 
-    title: str = "untitled"
+    title: Title = "untitled"
     stage: StageSection
     daq: DaqSection
     force: ForceSection

@@ -66,7 +66,21 @@ def open_instruments(request: Request) -> Opened:
     """
     if request.bench.is_emulated:
         return _open_emulated(request)
-    return _open_wired(request.bench, request.scene.uses_pressure, time.perf_counter)
+    return _open_claimed(request.bench, request.scene.uses_pressure)
+
+
+def _open_claimed(bench: Bench, pressure: bool) -> Opened:
+    """Open real instruments, which no other program may have."""
+    from rig.one_rig import Claim
+
+    claim = Claim(bench, pressure=pressure)
+    try:
+        opened = _open_wired(bench, pressure, time.perf_counter)
+    except BaseException:
+        claim.release()
+        raise
+    opened.shut_down = claim.release
+    return opened
 
 
 def _open_emulated(request: Request) -> Opened:

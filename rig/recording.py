@@ -167,14 +167,23 @@ def as_run(recording: Recording) -> Run:
         steps=recording.step_table(),
         parameters=scene.parameters(),
         sensors=sensors(bench),
-        settings={
-            key: value
-            for key, value in scene.protocol.model_dump().items()
-            if isinstance(value, int | float | str) and not isinstance(value, bool)
-        },
+        settings=_settings(recording),
         complete=recording.ending is not None and recording.ending[1] == 0,
         pump_volume=_pump_volume(recording),
     )
+
+
+def _settings(recording: Recording) -> dict[str, float | str]:
+    """Return the scene's plain values, the gripper's kind and the place, as the analysis asks for them."""
+    protocol = recording.scene.protocol
+    settings: dict[str, float | str] = {
+        key: value for key, value in protocol.model_dump().items() if isinstance(value, int | float | str)
+    }
+    settings["gripper"] = recording.scene.gripper.kind
+    place = recording.configuration.get("place", "")
+    if place:
+        settings["sample" if protocol.name == "fiber" else "position"] = place
+    return settings
 
 
 def _pump_volume(recording: Recording) -> NDArray[np.float64] | None:
@@ -300,12 +309,25 @@ def _opened(path: Path, *, swmr: bool) -> Iterator[h5py.File]:
 def _entry(file: h5py.File, path: Path) -> h5py.Group:
     try:
         if file.attrs.get("format") == FORMAT:
+            _check_inside(file, path)
             return file["entry"]
     except (OSError, RuntimeError, KeyError, UnicodeDecodeError) as error:
         raise FileError(f"recording {path}: damaged ({error}). Remedy: try `rig recover` on a copy.") from error
     raise FileError(
         f"recording {path}: is not a recording of this rig. Remedy: choose a file that `rig run` has written."
     )
+
+
+def _check_inside(group: h5py.Group, path: Path) -> None:
+    """Refuse a file whose data lie in other files: a recording is whole, and must not show what it does not hold."""
+    for name in group:
+        item = group.get(name) if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+        if isinstance(item, h5py.Group):
+            _check_inside(item, path)
+        elif item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
+            raise FileError(
+                f"recording {path}: {group.name}/{name} lies outside of it. Remedy: use the file `rig run` has written."
+            )
 
 
 def _is_marked_open(path: Path) -> bool:

@@ -15,6 +15,7 @@ from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Subs
 from rig.errors import FileError
 from rig.validation import explain
 
+Title = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -113,7 +114,7 @@ class FiberSection(ContactSection):
     name: Literal["fiber"]
     preload_N: Annotated[float, Field(gt=0, le=50)] = 1e-3
     approach_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
-    retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 2.0
     preload_dwell_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
     contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 0.15
     fibers: Annotated[int, Field(ge=1)] = 3
@@ -194,7 +195,7 @@ WITH_CHAMBER = frozenset({"volume", "leak", "pressure_zero"})
 class Scene(Section):
     """A whole scene file."""
 
-    title: str = "untitled"
+    title: Title = "untitled"
     substrate: SubstrateSection
     gripper: GripperSection = GripperSection()
     membrane: MembraneSection = MembraneSection()

@@ -47,13 +47,18 @@ class Overtaken(Exception):
 
 
 @contextlib.contextmanager
-def emulators(*options: str) -> Iterator[tuple[dict[str, str], Any]]:
-    """Serve the emulated bench from another process; yield its endpoints and what ends it and returns its log."""
+def emulators(*options: str) -> Iterator[tuple[dict[str, str], Any, Any]]:
+    """Serve the emulated bench from another process; yield its endpoints, what commands it, what ends and reads it."""
     process = subprocess.Popen(
         [sys.executable, str(EMULATOR), *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     with process:
         assert process.stdout is not None
+
+        def command(line: str) -> None:
+            assert process.stdin is not None
+            process.stdin.write(f"{line}\n")
+            process.stdin.flush()
 
         def finish() -> dict[str, Any]:
             told, _ = process.communicate("end\n", timeout=60)
@@ -61,7 +66,7 @@ def emulators(*options: str) -> Iterator[tuple[dict[str, str], Any]]:
             return answer
 
         try:
-            yield json.loads(process.stdout.readline()), finish
+            yield json.loads(process.stdout.readline()), command, finish
         finally:
             process.kill()
 
@@ -113,7 +118,7 @@ def kill_in(step: str, delay: float, folder: Path, seed: int = 0) -> Halt:
 
 
 def _kill_in(step: str, delay: float, folder: Path, seed: int) -> Halt:
-    with emulators("--seed", str(seed)) as (ends, finish):
+    with emulators("--seed", str(seed)) as (ends, _, finish):
         with start_run(folder, ends) as run:
             assert run.stderr is not None
             try:

@@ -1,8 +1,9 @@
 """The emulated bench in real time, in a process of its own, which keeps the plant's truth: run as a script.
 
-Prints its endpoints as one line of JSON; the first line on standard input makes it print its log and end. A row of the
-log is (monotonic time, samples, height m, volume displaced m^3, least and greatest true force N since the row before).
-Besides, it notes when the stage's stop byte came in, and when the force fault of ``--over-range`` began.
+Prints its endpoints as one line of JSON, then obeys what it reads: ``trip N`` lets the force pass its limit N samples
+from now, ``clear`` ends that, anything else makes it print its log and end. A row of the log is (monotonic time, samples,
+height m, volume displaced m^3, least and greatest true force N since the row before). Besides, it tells the samples of
+the trips, and when the stage's stop bytes came in.
 """
 
 from __future__ import annotations
@@ -55,13 +56,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--vented", action="store_true")
-    parser.add_argument("--over-range", type=int, help="the force leaves its limits at this sample of the plant")
     arguments = parser.parse_args()
     truth = Truth.pull_off(seed=arguments.seed, vented=arguments.vented)
     truth = replace(truth, train=replace(truth.train, start_position=truth.train.contact_position + GAP))
     faults = Faults()
-    if arguments.over_range is not None:
-        faults.add(Fault("force", "over_range", at_sample=arguments.over_range, value=3.5))
+    trips: list[int] = []
     log: list[tuple[float, ...]] = []
     stops: list[float] = []
     with EmulatedBench(truth, seed=arguments.seed, speed=1.0, faults=faults, referenced=True, latency=5e-3) as bench:
@@ -70,8 +69,16 @@ def main() -> None:
         ends = bench.endpoints
         sys.stdout.write(json.dumps({"stage": ends.stage, "pump": ends.pump, "daq": ends.daq}) + "\n")
         sys.stdout.flush()
-        sys.stdin.readline()
-    sys.stdout.write(json.dumps({"log": log, "stops": stops}) + "\n")
+        for line in sys.stdin:
+            word, _, number = line.strip().partition(" ")
+            if word == "trip":
+                trips.append(bench.plant.sample + int(number))
+                faults.add(Fault("force", "over_range", at_sample=trips[-1], value=4.7))
+            elif word == "clear":
+                faults.clear()
+            else:
+                break
+    sys.stdout.write(json.dumps({"log": log, "stops": stops, "trips": trips}) + "\n")
     sys.stdout.flush()
 
 

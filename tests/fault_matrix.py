@@ -39,16 +39,17 @@ STEPS = ("tare", "approach", "preload", "dwell", "pressurize", "retract", "pull-
 TO_PRESSURIZE = STEPS[:5]
 REPEATED = ("preload", "pressurize", "retract")
 MOVING = ("approach", "preload", "retract", "pull-off", "return")
-PROTOCOL = {**SHORT, "tare_s": 0.3, "preload_dwell_s": 0.5, "retract_speed_um_s": 200.0, "approach_speed_um_s": 200.0}
+PROTOCOL = {**SHORT, "tare_s": 0.3, "preload_dwell_s": 0.5, "retract_speed_um_s": 200.0}
 START_MM = 22.5
+LIMIT = load_bench(None)[0].limits.compression_N
 PATIENCE_MS = 1000.0
 """Longer than the benches' time-outs: the computer of a test may be busy."""
 LATER = 100
 """Samples between the beginning of a step and the fault."""
 
 LOOK_AHEAD = 50e-6
-AT_REST = 2e-6
-"""What a stage may still travel after its stop has been acknowledged: the servo's lag, m."""
+AT_REST = 5e-6
+"""What a stage may still travel after its stop: from 500 um/s the brake and the lag of the servo take 3 um, m."""
 AFTERWARDS = 30.0
 """Plant seconds watched after the run."""
 
@@ -507,8 +508,8 @@ def page(verdicts: Sequence[Verdict]) -> str:
         f"acknowledged sample is there as the DAQ delivered it), {sum(not v.unclear for v in verdicts)} with the right "
         "exit code and one message that names instrument, step and remedy.",
         "",
-        f"Largest true force: {max(v.largest_force for v in verdicts):.3f} N (limit 3 N). Furthest the stage went on "
-        f"after the run had ended: {max(v.overrun for v in verdicts) * 1e6:.1f} um (look-ahead 50 um, when unplugged), "
+        f"Largest true force: {max(v.largest_force for v in verdicts):.3f} N (limit {LIMIT:g} N). Furthest the stage went "
+        f"on after the run had ended: {max(v.overrun for v in verdicts) * 1e6:.1f} um (look-ahead 50 um, when unplugged), "
         f"{max(v.overrun for v in verdicts if 'unplugged' not in v.trouble) * 1e6:.1f} um otherwise.",
         "",
         "A number is the run's exit code (2 file, 3 interlock, 4 step failed, 6 instrument, 70 defect of the program, "
