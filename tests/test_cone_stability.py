@@ -15,7 +15,7 @@ from analysis.accuracy.stability_study import is_sound
 from model import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate, cone
 from model.prediction import Outcome
 
-MANY = settings(max_examples=1000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+MANY = settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 SOME = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 FEATURES = ("pull_off_force", "pull_off_distance", "zero_force_position", "detachment_position", "detachment_radius")
 

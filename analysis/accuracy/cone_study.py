@@ -137,9 +137,9 @@ def comparison(table: pd.DataFrame) -> Section:
     text = (
         f"One scene ({name}), one run, one process. {described['setting']} grid as the SI describes it (energy as "
         f"printed at every point, both derivatives everywhere): {described['median_s']:.3g} s; our solver with the "
-        f"whole profile, F_p, D_p and zero of force: {ours['median_s'] * 1e3:.3g} ms in the median "
+        f"whole profile and all features: {ours['median_s'] * 1e3:.3g} ms in the median "
         f"({ours['lower_s'] * 1e3:.3g} ms lower quartile), **{described['times_slower']:,.0f} times faster** "
-        f"({hoisted['times_slower']:,.0f} times faster than the grid with everything hoisted that can be). Error of F_p "
+        f"({hoisted['times_slower']:,.0f} times faster than the grid with all hoisted that can be). Error of F_p "
         f"{described['error_F_p']:.1e} against {ours['error_F_p']:.1e}, of D_p {described['error_D_p']:.1e} against "
         f"{ours['error_D_p']:.1e}."
     )

@@ -59,8 +59,8 @@ def _limits(quick: bool, progress: Progress) -> Section:
     ]
     text = (
         "Every limit is approached with the order it must have, down to rounding: the contact reaching the rim "
-        "(r_e -> R_0, where differences of the tabulated energy oscillate, SI Fig. S8; r_e = R_0 itself is the last "
-        "point), the sphere growing flat and the chamber growing large with first order, the sphere passing the width "
+        "(r_e -> R_0, where differences of the tabulated energy oscillate, SI Fig. S8) "
+        ", the sphere growing flat and the chamber growing large with first order, the sphere passing the width "
         "of the gripper without a step in F_p and D_p. z_0 itself changes as the square root of r_b / R_0 - 1 there "
         "(EML Eqs. 12 and 13), which the features do not feel."
     )
@@ -272,7 +272,9 @@ def never_tensile(scene: Parameters, contact_stretch: bool) -> bool:
     march = reference.March(scene, contact_stretch)
     z, r = march.path()
     force = march.force(r, z)
-    rounding = 1e-12 * scene.membrane.youngs_modulus * scene.membrane.thickness * scene.gripper.radius
+    R_0, membrane = scene.gripper.radius, scene.membrane
+    largest = membrane.youngs_modulus * membrane.thickness * R_0 + scene.gas.atmospheric_pressure * R_0**2
+    rounding = 1e-12 * largest
     return not bool((force[np.isfinite(force)] < -rounding).any())
 
 
@@ -297,7 +299,7 @@ def _conditions(progress: Progress) -> Section:
         "are of order one, also with lengths that coincide to 1e-9: the features vary smoothly and rounding is not "
         "amplified. They grow in two corners, where predictions say so themselves by their error estimate and a "
         "warning: F_p as the small difference of two large forces (a hard inflated membrane with hardly any adhesion: "
-        "the ratio of the pressure force to F_p, up to 1e7 in the random scenes), and positions on a contact edge at "
+        "the ratio of the pressure force to F_p), and positions on a contact edge at "
         "the equator of the sphere (the slope dh/dr, 1e4 at 1e-9 from it)."
     )
     return Section(
