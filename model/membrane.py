@@ -278,7 +278,7 @@ def _drift(place: Place, extreme: Chebyshev, read: Chebyshev) -> float:
     noise = place.piece.panel.tail * float(np.abs(extreme.coef).max())
     curvature = abs(float(extreme.deriv(2)(place.coordinate)))
     shift = 2 * noise * len(extreme.coef) ** 2 / (high - low) / curvature if curvature else math.inf
-    return min(shift, float(high - low)) * abs(float(read.deriv()(place.coordinate)))
+    return float(min(shift, high - low)) * abs(float(read.deriv()(place.coordinate)))
 
 
 def _zero_error(scaled: Scene, read: Features, counter: Counter) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from model.errors import NotConverged
 from model.membrane_branch import Counter, Line, pinned_line, pinned_state
-from model.membrane_equilibrium import Annulus, Closure, node_positions, resample, shape, solve
+from model.membrane_equilibrium import Annulus, Closure, node_positions, release_slope, resample, shape, solve
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ def _panels(
     depth: int,
 ) -> list[Panel]:
     """Cover a line with panels whose series end; a pinned line may keep gaps where it is slack."""
-    panel = None
+    panel, coarse = None, line
     for size in PANEL_SIZES:
         finer = _panel(annulus, line, ends, width, resolution.order, size, counter)
         if finer is None:
@@ -177,12 +177,22 @@ def _panels(
         if panel is None and width is None:
             raise NotConverged("membrane: the branch was found but its refinement did not converge")
         return [] if panel is None else [panel]
+    if panel is not None and width is None:
+        line = _upper_roots(annulus, panel, coarse)
     middle = (ends[0] + ends[1]) / 2
     return [
         half
         for part in ((ends[0], middle), (middle, ends[1]))
         for half in _panels(annulus, line, part, width, resolution, counter, depth - 1)
     ]
+
+
+def _upper_roots(annulus: Annulus, panel: Panel, coarse: Line) -> Line:
+    """Return the states of a panel without those that fell on the lower root, or the line it was guessed from."""
+    upper = release_slope(annulus, panel.width, panel.state) > 0
+    if not upper[0] or not upper[-1]:
+        return coarse
+    return Line(panel.coordinate[upper], panel.state[upper])
 
 
 def _panel(
