@@ -58,9 +58,8 @@ def frame(number: int, *, pressure: bool = True) -> Frame:
 def prediction() -> LivePrediction:
     x = np.linspace(0.0, 1e-3, 5)
     one = Estimate(1.0, 0.9, float("inf"))
-    return LivePrediction(
-        7, 160, "cone", x, -x, -x - 1, -x + 1, None, one, one, one, one, 2e-3, True, "", 0.5, {"F": 1e-9}, 0.01
-    )
+    curve = (x, -x, -x - 1, -x + 1, None, None, None)
+    return LivePrediction(7, 160, "cone", *curve, one, one, one, one, 2e-3, True, "", 0.5, {"F": 1e-9}, 0.01)
 
 
 def wait_for(condition: Any, what: str) -> None:

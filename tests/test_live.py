@@ -44,7 +44,7 @@ def glances(truth: Parameters, *, noise: float = 3e-4, seed: int = 1, shape: flo
     random = np.random.default_rng(seed)
     plan: list[tuple[str, np.ndarray]] = [
         ("tare", np.full(50, 1e-3)),
-        ("approach", np.linspace(1e-3, 0.0, 60, endpoint=False)),
+        ("approach", np.linspace(1e-3, -5e-6, 400)),
         ("dwell", np.full(40, start)),
         ("retract", np.arange(start, found.detachment_position + 0.2e-3, SPEED * SAMPLES / RATE)),
     ]
@@ -54,7 +54,7 @@ def glances(truth: Parameters, *, noise: float = 3e-4, seed: int = 1, shape: flo
             touching = name in ("dwell", "retract") and z <= found.detachment_position
             force = float(np.interp(z, found.position, found.force)) if touching else 0.0
             force -= shape * np.sin(3e3 * z) if touching and name == "retract" else 0.0
-            force += 4e-3 if name == "approach" and z < 20e-6 else 0.0
+            force += 4e-3 if name == "approach" and z < 0 else 0.0
             gas = float(np.interp(z, found.position, found.pressure)) if touching else 0.0
             number = len(frames)
             glance = Glance(
@@ -85,7 +85,7 @@ def announced(truth: Parameters, part: float, **options: float) -> LivePredictio
     predictor._estimator.mend = dataclasses.replace(predictor._estimator.mend)
     zero = APEX + found.zero_force_position
     result = None
-    for step in sorted({0.0, part / 2, part}):
+    for step in sorted({min(part, 0.0), part / 2, part}):
         result = predictor.predict(gathered(frames, step, found.pull_off_distance, zero))
     assert result is not None
     return result
@@ -110,7 +110,7 @@ def test_gathering_feels_the_touch_and_knows_p0_and_the_end() -> None:
         gathering.add(glance)
     evidence = gathering.evidence()
     assert evidence.force_zero == pytest.approx(ZERO, abs=5e-5)
-    assert evidence.touch == pytest.approx(APEX + 20e-6, abs=20e-6)
+    assert evidence.touch == pytest.approx(APEX, abs=5e-6)
     assert evidence.initial_pressure == pytest.approx(
         np.interp(evidence.start - APEX, predict(truth).position, predict(truth).pressure), abs=2.0
     )
@@ -123,7 +123,7 @@ def test_gathering_feels_the_touch_and_knows_p0_and_the_end() -> None:
 def test_the_effective_work_of_adhesion_is_learnt_from_the_frames(work: float) -> None:
     truth = specimen(work)
     found = predict(truth)
-    early, late = announced(truth, 0.02), announced(truth, 0.6)
+    early, late = announced(truth, -0.12), announced(truth, 0.6)
     said = late.work_of_adhesion
     assert said.low <= truth.membrane.work_of_adhesion <= said.high
     assert said.high - said.low < 0.8 * (early.work_of_adhesion.high - early.work_of_adhesion.low)
@@ -151,7 +151,7 @@ def test_p0_is_the_measured_one_not_the_scenes() -> None:
     assert high.pressure is not None
     for said, pressure in ((low, -500.0), (high, 1500.0)):
         true = predict(specimen(pressure=pressure))
-        assert said.pull_off_force.value == pytest.approx(true.pull_off_force, rel=0.1)
+        assert said.pull_off_force.value == pytest.approx(true.pull_off_force, rel=0.15)
         middle = 0.4 * true.pull_off_distance
         assert np.interp(middle, said.retraction, said.pressure) == pytest.approx(
             np.interp(middle, true.retraction, true.pressure), abs=60.0

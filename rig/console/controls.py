@@ -120,8 +120,8 @@ class Transport(QWidget):
         self.play.setCheckable(True)
         self.back = button("\u25c0 step", "Left", "One frame back", actions["back"])
         self.forward = button("step \u25b6", "Right", "One frame on", actions["forward"])
-        self.previous = button("\u23ee", "PgUp", "To the start of the step before", actions["previous"])
-        self.next = button("\u23ed", "PgDown", "To the start of the next step", actions["next"])
+        self.previous = button("|\u25c0", "PgUp", "To the start of the step before", actions["previous"])
+        self.next = button("\u25b6|", "PgDown", "To the start of the next step", actions["next"])
         self.leave = button("Close", "Ctrl+W", "Leave the replay", actions["leave"])
         self.speed = QComboBox()
         for speed in SPEEDS:

@@ -267,7 +267,7 @@ def _interval(symbol: str, estimate: Estimate | None, scale: float, unit: str) -
 def _at_start(first: LivePrediction) -> str:
     force, distance = first.pull_off_force, first.pull_off_distance
     return (
-        "<span style='font-size:13px'>announced at P\u2080: "
+        "<span style='font-size:13px'>at P\u2080: "
         f"F<sub>p</sub> {number(force.low, 2)}\u2013{number(force.high, 2)} N, "
         f"D<sub>p</sub> {number(distance.low * 1e3, 2)}\u2013{number(distance.high * 1e3, 2)} mm</span>"
     )
