@@ -1,0 +1,182 @@
+"""Campaigns: one order for one seed, nothing measured twice, nothing lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import scene_text
+
+from rig.campaign import JOURNAL, Journal, load_campaign
+from rig.cli import main
+from rig.errors import FileError
+from rig.recording import load_recording
+
+FILE = """
+title = "small"
+order = "{order}"
+seed = {seed}
+repeats = 3
+
+[[test]]
+scene = "zero.toml"
+
+[[test]]
+scene = "weights.toml"
+repeats = 2
+"""
+
+
+@pytest.fixture
+def campaign(tmp_path) -> Path:
+    """Return a campaign of five short recordings."""
+    (tmp_path / "zero.toml").write_text(scene_text("pressure-zero", rest_s=0.5), "utf-8")
+    (tmp_path / "weights.toml").write_text(scene_text("dead-weights", rest_s=0.5, masses_g=[0.0, 50.0]), "utf-8")
+    path = tmp_path / "small.toml"
+    path.write_text(FILE.format(order="random", seed=4), "utf-8")
+    return path
+
+
+def keys(path):
+    return [test.key for test in load_campaign(path)[1]]
+
+
+def run(path, folder):
+    return main(["campaign", str(path), "--direct", "--out", str(folder)])
+
+
+def journal(folder):
+    return [json.loads(line) for line in (folder / JOURNAL).read_text("utf-8").splitlines()]
+
+
+def test_table_s1_is_eight_conditions_five_times():
+    campaign, tests = load_campaign(Path(__file__).parents[1] / "campaigns" / "table-s1.toml")
+    conditions = {
+        (t.scene.substrate.shape, t.scene.substrate.diameter_mm, t.scene.protocol.initial_pressure_kPa) for t in tests
+    }
+    assert campaign.repeats == 5
+    assert (len(tests), len(conditions), len({test.key for test in tests})) == (40, 8, 40)
+    for test in tests:
+        assert f"initial_pressure_kPa = {test.scene.protocol.initial_pressure_kPa!r}" in test.scene_text
+
+
+def test_random_order_belongs_to_the_seed(tmp_path, campaign):
+    first = keys(campaign)
+    assert keys(campaign) == first
+    orders = set()
+    for seed in range(6):
+        campaign.write_text(FILE.format(order="random", seed=seed), "utf-8")
+        orders.add(tuple(keys(campaign)))
+    campaign.write_text(FILE.format(order="given", seed=4), "utf-8")
+    assert len(orders) > 1
+    assert all(sorted(order) == sorted(keys(campaign)) for order in orders)
+
+
+def test_places_and_repeats_of_a_scene_have_seeds_and_prompts_of_their_own(tmp_path):
+    (tmp_path / "c.toml").write_text('title = "c"\n[[test]]\nscene = "fiber"\nprompt = "Mount the fibres."\n', "utf-8")
+    _, tests = load_campaign(tmp_path / "c.toml")
+    assert len(tests) == len({test.seed for test in tests}) == 15
+    assert {test.place for test in tests} == {"SPL#1", "SPL#2", "SPL#3"}
+    assert tests[0].prompt == "Mount the fibres. Bring the probe over SPL#1."
+    assert len({test.setup for test in tests}) == 3
+
+
+def test_a_finished_campaign_is_not_measured_again(tmp_path, campaign, capsys):
+    folder = tmp_path / "out"
+    assert run(campaign, folder) == 0
+    before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert run(campaign, folder) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+    assert "5 tests, 5 done" in capsys.readouterr().err
+
+
+def test_a_campaign_killed_half_way_is_taken_up_where_it_stopped(tmp_path, campaign):
+    folder = tmp_path / "out"
+    command = [sys.executable, "-m", "rig", "campaign", str(campaign), "--direct", "--out", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not ((folder / JOURNAL).exists() and len(journal(folder)) >= 2):
+        assert process.poll() is None
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+    done = [entry["key"] for entry in journal(folder)]
+    whole = {name: (folder / name).read_bytes() for name in (entry["recording"] for entry in journal(folder))}
+    assert len(done) < 5
+    assert run(campaign, folder) == 0
+    entries = journal(folder)
+    assert [entry["key"] for entry in entries][: len(done)] == done
+    assert sorted(entry["key"] for entry in entries) == sorted(keys(campaign))
+    for name, content in whole.items():
+        assert (folder / name).read_bytes() == content
+    for entry in entries:
+        assert load_recording(folder / entry["recording"]).ending == ("done", 0)
+
+
+def test_a_torn_last_line_counts_as_unwritten(tmp_path):
+    found = Journal(tmp_path)
+    found.write("a", "a.h5")
+    found.write("b", "b.h5")
+    path = tmp_path / JOURNAL
+    path.write_bytes(path.read_bytes()[:-9])
+    assert found.done() == {"a": "a.h5"}
+    found.write("c", "c.h5")
+    assert found.done() == {"a": "a.h5", "c": "c.h5"}
+    assert all(json.loads(line) for line in path.read_text("utf-8").splitlines())
+
+
+def test_a_line_torn_anywhere_is_never_taken_for_an_entry(tmp_path):
+    found = Journal(tmp_path)
+    found.write("first", "first.h5")
+    found.write("second", "second.h5")
+    path = tmp_path / JOURNAL
+    content = path.read_bytes()
+    first = content.index(b"\n") + 1
+    for length in range(first, len(content) - 2):
+        path.write_bytes(content[:length])
+        assert found.done() == {"first": "first.h5"}
+
+
+def test_a_damaged_line_in_the_middle_is_told_with_its_number(tmp_path):
+    (tmp_path / JOURNAL).write_text('{"key": "a", "recording": "a.h5"}\nrubbish\n{"key": "b"}\n', "utf-8")
+    with pytest.raises(FileError, match=r"line 2: no entry .* Remedy"):
+        Journal(tmp_path).done()
+
+
+def test_a_whole_recording_without_an_entry_is_adopted_and_a_broken_one_is_kept(tmp_path, campaign, capsys):
+    folder = tmp_path / "out"
+    assert run(campaign, folder) == 0
+    path = folder / JOURNAL
+    entries = journal(folder)
+    lost, broken = entries[1], entries[3]
+    path.write_text("".join(json.dumps(e) + "\n" for e in entries if e not in (lost, broken)), "utf-8")
+    (folder / broken["recording"]).write_bytes(b"half a recording")
+    content = (folder / lost["recording"]).read_bytes()
+    capsys.readouterr()
+    assert run(campaign, folder) == 0
+    assert "1 of them found whole without an entry" in capsys.readouterr().err
+    recordings = {entry["key"]: entry["recording"] for entry in journal(folder)}
+    assert recordings[lost["key"]] == lost["recording"]
+    assert (folder / lost["recording"]).read_bytes() == content
+    assert recordings[broken["key"]] == broken["recording"].replace(".h5", "~2.h5")
+    assert (folder / broken["recording"]).read_bytes() == b"half a recording"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends a signal to a process")
+def test_ctrl_c_ends_a_campaign_and_leaves_it_to_be_taken_up(tmp_path, campaign):
+    folder = tmp_path / "out"
+    command = [sys.executable, "-m", "rig", "campaign", str(campaign), "--direct", "--out", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not ((folder / JOURNAL).exists() and journal(folder)):
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate()
+    assert process.returncode != 0
+    assert "Traceback" not in error
+    assert run(campaign, folder) == 0
+    assert sorted(entry["key"] for entry in journal(folder)) == sorted(keys(campaign))

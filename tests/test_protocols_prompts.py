@@ -1,0 +1,106 @@
+"""The operator answers prompts from the keyboard while the loop goes on."""
+
+from __future__ import annotations
+
+import io
+import os
+import time
+
+import pytest
+from conftest import scene_text
+
+from rig.bench import load_bench
+from rig.errors import Refused
+from rig.observe import Controls, Event, Watcher, Wish
+from rig.operator import Keyboard, Prompts
+from rig.recording import load_recording
+from rig.scene import parse_scene
+from rig.session import Request, run_scene
+
+PROMPT = Event(0, "prompt", "Hang 20 g on the gripper, then go on")
+
+
+@pytest.fixture
+def line():
+    """Return a keyboard and what presses its Enter."""
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "r") as stream, os.fdopen(writer, "w", buffering=1) as press:
+        yield Keyboard(stream), press
+
+
+def taken(controls):
+    """Return the operator's next wish."""
+    while (wish := controls.take()) is Wish.NONE:
+        time.sleep(0.001)
+    return wish
+
+
+def test_enter_resumes_the_run_that_asked(line):
+    keyboard, press = line
+    controls = Controls()
+    Prompts(keyboard, controls).event(PROMPT)
+    press.write("\n")
+    assert taken(controls) is Wish.RESUME
+    press.close()
+
+
+def test_only_a_prompt_is_answered(line):
+    keyboard, press = line
+    controls = Controls()
+    Prompts(keyboard, controls).event(Event(0, "warning", "the load is high"))
+    press.write("\n")
+    press.close()
+    assert controls.take() is Wish.NONE
+
+
+def test_between_runs_the_program_waits_for_enter(line, capsys):
+    keyboard, press = line
+    press.write("\n")
+    keyboard.answer_for(controls := Controls())
+    assert taken(controls) is Wish.RESUME
+    press.write("\n")
+    press.close()
+    keyboard.confirm("Mount the 60 mm sphere.")
+    assert "Mount the 60 mm sphere. Press Enter to go on." in capsys.readouterr().err
+
+
+def test_a_closed_keyboard_refuses_and_names_the_console(capsys):
+    keyboard = Keyboard(io.StringIO(""))
+    with pytest.raises(Refused, match="Nobody can answer"):
+        keyboard.confirm("Mount the sphere.")
+    Prompts(keyboard, Controls()).event(PROMPT)
+    assert "resume in the console" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_run_waits_at_a_prompt_and_keeps_recording(tmp_path, line, monkeypatch):
+    keyboard, press = line
+    controls = Controls()
+
+    class Operator(Watcher):
+        """Takes half a second of the bench's time over everything."""
+
+        asked_at = None
+
+        def event(self, event):
+            if event.kind == "prompt":
+                self.asked_at = event.sample
+
+        def frame(self, frame):
+            if self.asked_at is not None and frame.stop >= self.asked_at + 500:
+                self.asked_at = None
+                press.write("\n")
+
+    monkeypatch.setattr("rig.emulation.Hands.event", Watcher.event)
+    bench, bench_text = load_bench(None)
+    text = scene_text("pressure-zero", rest_s=0.5)
+    observers = [Prompts(keyboard, controls), Operator()]
+    out = tmp_path / "run.h5"
+    request = Request(
+        parse_scene(text, "scene"), text, bench, bench_text, out,
+        wire=False, live=False, controls=controls, observers=observers,
+    )  # fmt: skip
+    assert run_scene(request).exit_code == 0
+    press.close()
+    steps = {step.name: step for step in load_recording(out).step_table()}
+    assert steps["open"].stop - steps["open"].start >= 500
+    assert steps["zero"].stop - steps["zero"].start >= 500
