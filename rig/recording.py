@@ -18,11 +18,20 @@ from analysis.run import Run, Sensors, Step
 from rig.bench import Bench, parse_bench
 from rig.errors import FileError
 from rig.observe import StepPhase
-from rig.recorder import ENDING, FORMAT
+from rig.recorder import ENDING, EVENTS, FORMAT, FRAMES, PREDICTIONS, PUMP, STAGE, STEPS
 from rig.scene import Scene, parse_scene
 from rig.seal import is_sealed, probe
 
 _PER_SAMPLE = ("raw/volts", "data/time", "data/force", "data/height", "data/pressure")
+_TABLES = {
+    "raw/frames": FRAMES,
+    "raw/stage": STAGE,
+    "raw/pump": PUMP,
+    "steps": STEPS,
+    "events": EVENTS,
+    "predictions": PREDICTIONS,
+    "ending": ENDING,
+}
 _PER_FRAME = ("raw/frames", "raw/stage")
 
 
@@ -218,6 +227,7 @@ def sensors(bench: Bench) -> Sensors:
 def _load(entry: h5py.Group, path: Path) -> Recording:
     try:
         _check_sizes(entry, path)
+        _check_kinds(entry)
         return _read(entry, path)
     except FileError:
         raise
@@ -240,6 +250,16 @@ def _check_sizes(entry: h5py.Group, path: Path) -> None:
     entry.visititems(count)
     if claimed > 2 * path.stat().st_size:
         raise FileError(f"recording {path}: damaged: it claims {claimed} bytes of data. Remedy: restore a copy.")
+
+
+def _check_kinds(entry: h5py.Group) -> None:
+    """Raise ``ValueError`` where a dataset is not of the kind the recorder makes."""
+    for name in filter(entry.__contains__, _PER_SAMPLE):
+        if entry[name].ndim != (2 if name == "raw/volts" else 1) or entry[name].dtype.kind != "f":
+            raise ValueError(f"{name} holds no numbers by sample")
+    for name, table in _TABLES.items():
+        if name in entry and (entry[name].ndim != 1 or entry[name].dtype.names != table.names):
+            raise ValueError(f"{name} is not the table it should be")
 
 
 def _read(entry: h5py.Group, path: Path) -> Recording:

@@ -508,8 +508,8 @@ def page(verdicts: Sequence[Verdict]) -> str:
         f"acknowledged sample is there as the DAQ delivered it), {sum(not v.unclear for v in verdicts)} with the right "
         "exit code and one message that names instrument, step and remedy.",
         "",
-        f"Largest true force: {max(v.largest_force for v in verdicts):.3f} N (limit {LIMIT:g} N). Furthest the stage went "
-        f"on after the run had ended: {max(v.overrun for v in verdicts) * 1e6:.1f} um (look-ahead 50 um, when unplugged), "
+        f"Largest true force: {max(v.largest_force for v in verdicts):.3f} N (limit {LIMIT:g} N). Furthest the "
+        f"stage went on after a run: {max(v.overrun for v in verdicts) * 1e6:.1f} um unplugged (look-ahead 50 um), "
         f"{max(v.overrun for v in verdicts if 'unplugged' not in v.trouble) * 1e6:.1f} um otherwise.",
         "",
         "A number is the run's exit code (2 file, 3 interlock, 4 step failed, 6 instrument, 70 defect of the program, "
