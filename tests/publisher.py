@@ -148,11 +148,15 @@ def publish(server: LinkServer, controls: Controls, speed: float, *, pressure: b
         if isinstance(told, Frame):
             wish = controls.take()
             while wish is Wish.HOLD or (paused and wish is Wish.NONE):
+                if wish is Wish.HOLD:
+                    server.event(Event(told.start, "operator", "hold"))
                 paused = True
                 held = time.monotonic()
                 time.sleep(0.02)
                 begin += time.monotonic() - held
                 wish = controls.take()
+            if paused:
+                server.event(Event(told.start, "operator", "resume"))
             paused = False
             if wish in (Wish.STOP, Wish.EMERGENCY):
                 server.event(Event(told.start, "operator", wish.value))

@@ -12,7 +12,7 @@ from rig.console.playhead import Playhead
 from rig.console.story import Story
 from rig.console.timing import durations, time_left, time_to_pull_off
 from rig.console.words import condition, duration, fraction, number, progress
-from rig.observe import Ending, StepEvent, StepPhase, StepPlan
+from rig.observe import Ending, Event, StepEvent, StepPhase, StepPlan
 from rig.wire import Gap, samples_of
 from sequences.frame import Frame
 
@@ -141,3 +141,17 @@ def test_the_playhead_plays_pauses_steps_and_jumps() -> None:
     head.playing, head.speed = True, math.inf
     assert head.advance(0.001, 1000.0, 100_000) == 100_000
     assert Playhead(live=True).advance(0.0, 1000.0, 777) == 777
+
+
+def test_what_a_run_waits_for_is_its_own_word() -> None:
+    story = Story(publisher.info())
+    assert story.waiting(story.at(0)) == ""
+    for kind, text, expected in (
+        ("operator", "hold", "hold"),
+        ("note", "still here", "hold"),
+        ("operator", "resume", ""),
+        ("prompt", "hang 20 g", "hang 20 g"),
+        ("operator", "resume", ""),
+    ):
+        story.add(Event(0, kind, text))
+        assert story.waiting(story.at(0)) == expected

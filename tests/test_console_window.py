@@ -28,7 +28,7 @@ from rig.console.runner import Child, replay_arguments, run_arguments
 from rig.console.theme import THEMES
 from rig.console.window import Console
 from rig.link import DIRECTORY_VARIABLE, LinkServer
-from rig.observe import Controls, Wish
+from rig.observe import Controls, Event, Wish
 
 WAIT_MS = 30_000
 
@@ -162,6 +162,18 @@ def test_hold_resume_and_stop_with_keys(console: Console, qtbot: QtBot, publish:
     qtbot.waitUntil(lambda: console.state.text() == "stopped", timeout=WAIT_MS)
     assert published.ended is Wish.STOP
     assert "Stop by the operator" in console.banner.text()
+
+
+def test_a_prompt_is_shown_and_answered(console: Console, qtbot: QtBot, publish: Callable[..., Published]) -> None:
+    published = publish(speed=2.0)
+    attach(console, qtbot)
+    published.controls.hold()
+    qtbot.waitUntil(lambda: console.state.text() == "holding", timeout=WAIT_MS)
+    published.server.event(Event(0, "prompt", "hang 20 g on the load cell"))
+    qtbot.waitUntil(lambda: "hang 20 g" in console.words.text(), timeout=WAIT_MS)
+    qtbot.waitUntil(console.controls.resume.isEnabled, timeout=WAIT_MS)
+    qtbot.mouseClick(console.controls.resume, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: console.state.text() == "running", timeout=WAIT_MS)
 
 
 @pytest.mark.parametrize("how", ["key", "mouse", "key in a dialog"])
@@ -361,3 +373,24 @@ def test_without_a_screen_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_the_application_is_qt(qapp: QApplication) -> None:
     assert qapp.platformName() in ("offscreen", "xcb")
+
+
+def test_rig_run_console_starts_the_same_run_in_a_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rig import cli
+    from rig.console import app
+
+    opened: list[dict[str, Any]] = []
+    monkeypatch.setattr(app, "open_console", lambda **options: opened.append(options) or 0)
+    words = ["run", "flat-low", "--console", "--direct", "--seed", "7", "--repeat", "2", "--speed", "4", "--no-live"]
+    assert cli.main(words) == 0
+    child = opened[0]["child"]
+    assert child[:3] == ["run", "flat-low", "--link"]
+    assert "--console" not in child
+    for part in (["--seed", "7"], ["--repeat", "2"], ["--speed", "4"], ["--direct"], ["--no-live"]):
+        place = child.index(part[0])
+        assert child[place : place + len(part)] == part
+    assert cli.main(["replay", "r.h5", "--console", "--model", "membrane"]) == 0
+    assert opened[1]["replay"] == Path("r.h5")
+    assert opened[1]["what_if"] == ("membrane", ())
+    assert cli.main(["console", "flat-low", "--theme", "light", "--alone"]) == 0
+    assert (opened[2]["scene"], opened[2]["theme"], opened[2]["attach"]) == ("flat-low", "light", False)

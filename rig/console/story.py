@@ -207,6 +207,15 @@ class Story:
         last = start + (peak + int(gone[0])) * window
         return float(tension[peak]), float(self.height.values[last]) - moment.zero_height
 
+    def waiting(self, moment: Moment) -> str:
+        """Return what the run waits for: ``hold``, the text of a prompt, or nothing."""
+        for event in reversed(self.events[: moment.events]):
+            if event.kind == "prompt" or (event.kind, event.text) == ("operator", "hold"):
+                return event.text
+            if (event.kind, event.text) == ("operator", "resume"):
+                return ""
+        return ""
+
     def boundaries(self, moment: Moment) -> list[tuple[int, str]]:
         """Return where each step so far began."""
         return [

@@ -379,20 +379,16 @@ class Console(QMainWindow):
     # ------------------------------------------------------------ commands
 
     def hold(self) -> None:
-        """Stop the motion and wait."""
-        self._command("hold", lambda: self._held(True))
+        """Stop the motion and wait. The run's own word, not this command, shows that it holds."""
+        self._command("hold", lambda: None)
 
     def resume(self) -> None:
         """Go on after a hold."""
-        self._command("resume", lambda: self._held(False))
+        self._command("resume", lambda: None)
 
     def stop(self) -> None:
         """End the run in good order; a run that does not answer is killed."""
         self._command("stop", lambda: self._set_state("stopping", "warning"))
-
-    def _held(self, held: bool) -> None:
-        self.holding = held
-        self._offer()
 
     def _command(self, command: str, done: Callable[[], None]) -> None:
         link = self.link
@@ -531,7 +527,12 @@ class Console(QMainWindow):
 
     def _show_texts(self, story: Story, moment: Moment) -> None:
         """Numbers change ten times a second: faster, nobody reads them, and each change lays the window out anew."""
-        self.words.setText(step_words(moment))
+        waiting = story.waiting(moment) if moment.ending is None else ""
+        if bool(waiting) != self.holding:
+            self.holding = bool(waiting)
+            self._offer()
+        prompt = "" if waiting in ("", "hold") else f"\u270b {waiting}  \u2192  Resume F7"
+        self.words.setText(prompt or step_words(moment))
         self.readings.show_moment(moment)
         first = story.predictions[0] if story.predictions else None
         self.prediction.show_moment(moment, first, story.measured(moment))
@@ -607,7 +608,8 @@ class Console(QMainWindow):
             elif self.link is None:
                 self._set_state("link lost", "fault")
             else:
-                self._set_state("holding" if self.holding else "running", "warning" if self.holding else "active")
+                words = {"": "running", "hold": "holding"}.get(story.waiting(moment), "waiting for you")
+                self._set_state(words, "warning" if self.holding else "active")
 
     def _say_cost(self, model: str, errors: dict[str, float], runtime_s: float, frame: str) -> None:
         units = {"pull_off_force": ("F_p", "N"), "pull_off_distance": ("D_p", "m")}
