@@ -54,9 +54,8 @@ def measure(folder: Path, frame_ms: float, trials: int, seed: int = 0) -> tuple[
             command("clear")
         told = finish()
     log = np.array(told["log"])
-    return np.array(
-        [stop - _moment(log, trip) for stop, trip in zip(told["stops"], told["trips"], strict=True)]
-    ), endings
+    moments = np.array([_moment(log, trip) for trip in told["trips"]])
+    return np.array([stop - moments[moments <= stop].max() for stop in told["stops"]]), endings
 
 
 def _moment(log: np.ndarray, sample: int) -> float:

@@ -1,0 +1,86 @@
+"""Many runs with faults and parameters at random, in one process: no unexplained exit, no growth."""
+
+from __future__ import annotations
+
+import gc
+import os
+import random
+import threading
+
+import psutil
+import pytest
+from fault_matrix import STEPS, request_of, troubles
+
+from drivers.emulated.faults import Fault
+from rig.recording import load_recording
+from rig.session import run_scene
+
+EXPLAINED = {0, 2, 3, 4, 6, 130}
+WARM_UP = 40
+"""Runs after which nothing may grow any more."""
+DIRECT, WIRED = (int(os.environ.get(name, most)) for name, most in (("SOAK_DIRECT", 10_000), ("SOAK_WIRED", 500)))
+
+
+def random_run(number: int, folder, *, wire: bool) -> None:
+    """One run with a random scene and, three times out of four, a fault somewhere."""
+    draw = random.Random(number)
+    scripted = [trouble for trouble in troubles() if trouble.faults and bool(trouble.wire) is wire]
+    trouble = draw.choice(scripted)
+    request = request_of(folder / "soak.h5", trouble, draw.choice(STEPS))
+    if draw.random() < 0.25:
+        request.faults = None
+    elif request.faults is not None:
+        request.faults.add(Fault("force", "noise", at_sample=draw.randrange(60_000), value=draw.uniform(1, 3)))
+    protocol = request.scene.protocol.model_copy(
+        update={
+            "preload_N": draw.uniform(0.05, 0.5),
+            "retract_speed_um_s": draw.uniform(100, 300),
+            "initial_pressure_kPa": draw.uniform(-4, 4),
+        }
+    )
+    request.scene = request.scene.model_copy(update={"protocol": protocol})
+    request.seed = number
+    ending = run_scene(request)
+    assert ending.exit_code in EXPLAINED, (number, ending)
+    if ending.exit_code:
+        assert "Remedy" in ending.reason or ending.exit_code == 130
+    assert load_recording(request.out).force.size == ending.samples
+    request.out.unlink()
+
+
+def soak(runs: int, folder, *, wire: bool) -> dict[str, tuple[float, float]]:
+    """Run so many; return memory (MB), threads and open files after the warm-up and at the end."""
+    process = psutil.Process()
+
+    def usage() -> tuple[float, float, float]:
+        gc.collect()
+        return process.memory_info().rss / 1e6, threading.active_count(), process.num_fds()
+
+    before = usage()
+    for number in range(runs):
+        random_run(number, folder, wire=wire)
+        if number == min(WARM_UP, runs // 2):
+            before = usage()
+    return dict(zip(("memory", "threads", "files"), zip(before, usage(), strict=True), strict=True))
+
+
+def check_growth(grown: dict[str, tuple[float, float]]) -> None:
+    assert grown["threads"][1] <= grown["threads"][0]
+    assert grown["files"][1] <= grown["files"][0]
+    assert grown["memory"][1] < grown["memory"][0] + 50
+
+
+def test_some_random_runs_leave_nothing_behind(tmp_path):
+    check_growth(soak(6, tmp_path, wire=False))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(0)
+def test_ten_thousand_random_runs(tmp_path):
+    check_growth(soak(DIRECT, tmp_path, wire=False))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(0)
+def test_five_hundred_random_runs_on_the_wire(tmp_path):
+    check_growth(soak(WIRED, tmp_path, wire=True))
