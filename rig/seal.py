@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from rig.errors import FileError
@@ -17,6 +18,7 @@ from rig.errors import FileError
 MARK = b"\nRIGSEAL1"
 PROBE_SECONDS = 20.0
 PROBE_BYTES_PER_SECOND = 10e6
+"""Processor time a probe may take: a sound file must not be called damaged because the computer is busy."""
 _LENGTH = len(MARK) + 32
 
 
@@ -44,16 +46,30 @@ def probe(path: Path) -> None:
     """
     command = [sys.executable, "-m", "rig.seal", str(path)]
     patience = PROBE_SECONDS + path.stat().st_size / PROBE_BYTES_PER_SECOND
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=patience, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise FileError(
-            f"recording {path}: damaged: reading it does not end within {patience:.0f} s. Remedy: restore a copy."
-        ) from error
-    if done.returncode:
-        lines = done.stderr.strip().splitlines()
-        text = lines[-1] if done.returncode == 1 and lines else f"reading it crashes (code {done.returncode})"
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as reader:
+        told = _words(reader, patience, path)
+    if reader.returncode:
+        lines = told.strip().splitlines()
+        text = lines[-1] if reader.returncode == 1 and lines else f"reading it crashes (code {reader.returncode})"
         raise FileError(text if text.startswith("recording ") else f"recording {path}: damaged: {text}.")
+
+
+def _words(reader: subprocess.Popen[str], patience: float, path: Path) -> str:
+    """Return what the reader says, unless it takes more processor time than it may."""
+    import psutil
+
+    clock = psutil.Process(reader.pid)
+    while True:
+        try:
+            return reader.communicate(timeout=0.5)[1]
+        except subprocess.TimeoutExpired as error:
+            with suppress(psutil.NoSuchProcess):  # it has just ended
+                if sum(clock.cpu_times()[:2]) > patience:
+                    reader.kill()
+                    raise FileError(
+                        f"recording {path}: damaged: reading it has no end ({patience:.0f} s of processor time). "
+                        "Remedy: restore a copy."
+                    ) from error
 
 
 def _main(path: Path) -> int:
