@@ -151,7 +151,22 @@ def leak(work: Extraction) -> Details:
         raise FeatureMissing("without parameters the chamber volume is unknown")
     length = max(1, round(0.1 * run.rate))
     time, gas = (block_means(signal[step.start : step.stop], length) for signal in (run.time, run.pressure))
-    gas_parameters = run.parameters.gas
-    found = fit_leak(time, gas, run.parameters.gripper.chamber_volume, gas_parameters.atmospheric_pressure)
-    work.set(leak_rate_Pa_s=abs(found.rate), leak_time_constant_s=found.time_constant, leak_flow_m3_s=abs(found.flow))
-    return {"decision": f"tau = {found.time_constant:.3g} s", "leak": found}
+    volume, atmosphere = run.parameters.gripper.chamber_volume, run.parameters.gas.atmospheric_pressure
+    found = fit_leak(time, gas, volume, atmosphere)
+    values = {
+        "leak_rate_Pa_s": abs(found.rate),
+        "leak_time_constant_s": found.time_constant,
+        "leak_flow_m3_s": abs(found.flow),
+    }
+    work.set(**values)
+    unsure = _disagreement(time, gas, found)
+    work.stated.update({name: unsure * abs(value) for name, value in values.items()})
+    return {"decision": f"tau = {found.time_constant:.3g} s; its halves differ by {2 * unsure:.1%}", "leak": found}
+
+
+def _disagreement(time: Array, pressure: Array, whole: Leak) -> float:
+    """Half the difference between the leak in the first and the second half, relative: drift of the sensor looks so."""
+    middle = time.size // 2
+    first, second = (fit_leak(time[part], pressure[part], 1.0) for part in (slice(middle), slice(middle, None)))
+    at_start = second.rate * float(np.exp((time[middle] - time[0]) / whole.time_constant))
+    return abs(first.rate - at_start) / 2 / abs(whole.rate) if whole.rate else 0.0

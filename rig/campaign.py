@@ -6,9 +6,11 @@ recording is closed; a test without a line is done again under a new name, and w
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import random
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +21,7 @@ from pydantic import Field, ValidationError
 
 from rig.errors import FileError
 from rig.library import find_scene
-from rig.scene import Scene, Section, parse_scene, read_text, validate_scene
+from rig.scene import Scene, Section, parse_scene, read_text
 from rig.validation import explain
 
 JOURNAL = "journal.jsonl"
@@ -72,6 +74,11 @@ class PlannedTest:
     setup: str
     prompt: str
 
+    @property
+    def digest(self) -> str:
+        """What was to be measured, in short; the journal keeps it to notice that a scene has been changed since."""
+        return hashlib.sha256(f"{self.scene_text}\0{self.place}".encode()).hexdigest()[:16]
+
 
 def load_campaign(path: Path) -> tuple[Campaign, list[PlannedTest]]:
     """Read and check a campaign file and every scene in it.
@@ -113,15 +120,15 @@ def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
 
 
 def _at_pressure(text: str, pressure: float, source: str) -> tuple[Scene, str]:
-    content: dict[str, Any] = tomllib.loads(text)
-    content.setdefault("protocol", {})["initial_pressure_kPa"] = pressure
-    lines = [line for line in text.splitlines() if not line.startswith("initial_pressure_kPa")]
-    place = next((i for i, line in enumerate(lines) if line.strip() == "[protocol]"), None)
+    """Return scene and text at another pressure; what is recorded is what is run."""
+    lines = [line for line in text.splitlines() if not re.match(r"\s*initial_pressure_kPa\s*=", line)]
+    place = next((i for i, line in enumerate(lines) if re.match(r"\s*\[\s*protocol\s*\]", line)), None)
     if place is None:
         lines += ["", "[protocol]", 'name = "pull_off"']
         place = len(lines) - 2
     lines.insert(place + 1, f"initial_pressure_kPa = {pressure!r}")
-    return validate_scene(content, source), "\n".join(lines) + "\n"
+    changed = "\n".join(lines) + "\n"
+    return parse_scene(changed, source), changed
 
 
 def _places(scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str) -> Iterator[PlannedTest]:
@@ -175,17 +182,36 @@ class Journal:
         FileError
             A line in the middle of the journal is no entry.
         """
+        return {key: str(entry["recording"]) for key, entry in self._entries().items()}
+
+    def check(self, tests: Sequence[PlannedTest]) -> None:
+        """Refuse a campaign whose scenes are no longer those that were measured.
+
+        Raises
+        ------
+        FileError
+            Names the test.
+        """
+        entries = self._entries()
+        for test in tests:
+            if test.key in entries and entries[test.key].get("scene", test.digest) != test.digest:
+                raise FileError(
+                    f"{self.folder / JOURNAL}: {test.key} was measured with another scene than the campaign names now. "
+                    "Remedy: restore the scene, or begin a new folder with --out."
+                )
+
+    def _entries(self) -> dict[str, dict[str, Any]]:
         path = self.folder / JOURNAL
         if not path.exists():
             return {}
-        entries: dict[str, str] = {}
-        lines = path.read_text(encoding="utf-8").split("\n")
+        entries: dict[str, dict[str, Any]] = {}
+        lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
         for number, line in enumerate(lines, 1):
             if not line:
                 continue
             try:
                 entry = json.loads(line)
-                entries[str(entry["key"])] = str(entry["recording"])
+                entries[str(entry["key"])] = {**entry, "recording": str(entry["recording"])}
             except (ValueError, KeyError, TypeError) as error:
                 if number == len(lines):
                     continue  # the program died while writing it
@@ -193,22 +219,22 @@ class Journal:
         return entries
 
     def write(self, key: str, recording: str, **more: Any) -> None:
-        """Append one finished test and sync it to the disk."""
+        """Append one finished test and sync it to the disk; ``more`` is kept with it."""
         self._mend()
         with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
             file.write(json.dumps({"key": key, "recording": recording, **more}) + "\n")
             file.flush()
             os.fsync(file.fileno())
 
-    def adopt(self, tests: Sequence[PlannedTest], is_whole: Callable[[Path], bool]) -> list[str]:
+    def adopt(self, tests: Sequence[PlannedTest], is_whole: Callable[[Path, PlannedTest], bool]) -> list[str]:
         """Enter tests whose recording is whole although the journal does not know them; return their keys."""
         done, adopted = self.done(), []
         for test in tests:
             if test.key in done:
                 continue
             for recording in sorted(self.folder.glob(f"{test.key}*.h5")):
-                if self._belongs(recording, test.key) and is_whole(recording):
-                    self.write(test.key, recording.name, adopted=True)
+                if self._belongs(recording, test.key) and is_whole(recording, test):
+                    self.write(test.key, recording.name, scene=test.digest, adopted=True)
                     adopted.append(test.key)
                     break
         return adopted

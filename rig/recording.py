@@ -157,6 +157,16 @@ def load_recording(path: Path) -> Recording:
         return _load(entry, path)
 
 
+def protocol_of(path: Path) -> str:
+    """Return the name of a recording's protocol without reading its data."""
+    with open_recording(path) as entry:
+        try:
+            text = entry["configuration/scene"].asstr()[()]
+        except (KeyError, OSError, RuntimeError, UnicodeDecodeError) as error:
+            raise FileError(f"recording {path}: damaged ({error}). Remedy: try `rig recover` on a copy.") from error
+    return parse_scene(text, f"{path}:scene").protocol.name
+
+
 def load_run(path: Path) -> Run:
     """Read a recording as the analysis sees it."""
     recording = load_recording(path)

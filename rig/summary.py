@@ -12,7 +12,6 @@ from rig.recording import as_run, load_recording
 
 if TYPE_CHECKING:
     from analysis.pipeline import Analysis
-    from analysis.run import Run
     from model.prediction import Prediction
 
 _ROWS = (
@@ -34,6 +33,7 @@ def summarise(path: Path, model: str = "cone") -> str:
     A calibration gives the lines of the bench file instead, and writes them beside the recording too.
     """
     from analysis import analyze
+    from analysis.figures import overview
     from analysis.figures.fit_picture import save_fit
 
     recording = load_recording(path)
@@ -54,21 +54,9 @@ def summarise(path: Path, model: str = "cone") -> str:
             prediction = predict(run.parameters, model)
         except ModelError as error:
             note = f"\nno prediction: {error}"
-    _draw(run, analysis, prediction, picture)
+    overview(run, analysis, prediction, picture)
     table = _table(analysis, prediction) if run.protocol == "pull_off" else _list(analysis)
     return f"{table}{note}\nrecording  {path}\npicture    {picture}"
-
-
-def _draw(run: Run, analysis: Analysis, prediction: Prediction | None, picture: Path) -> None:
-    """Draw what the protocol is about: force and pressure of a test, the fit of a chamber's."""
-    from analysis.figures import overview
-    from analysis.figures.fit_picture import chamber_picture, save_fit
-
-    fit = chamber_picture(run, analysis)
-    if fit is not None:
-        save_fit(fit, picture)
-    else:
-        overview(run, analysis, prediction, picture)
 
 
 def _table(analysis: Analysis, prediction: Prediction | None) -> str:

@@ -17,6 +17,7 @@ from rig.campaign import JOURNAL, Journal, load_campaign
 from rig.cli import main
 from rig.errors import FileError
 from rig.recording import load_recording
+from rig.scene import parse_scene
 
 FILE = """
 title = "small"
@@ -180,3 +181,36 @@ def test_ctrl_c_ends_a_campaign_and_leaves_it_to_be_taken_up(tmp_path, campaign)
     assert "Traceback" not in error
     assert run(campaign, folder) == 0
     assert sorted(entry["key"] for entry in journal(folder)) == sorted(keys(campaign))
+
+
+def test_a_scene_changed_after_its_test_is_refused(tmp_path, campaign, capsys):
+    folder = tmp_path / "out"
+    assert run(campaign, folder) == 0
+    scene = tmp_path / "zero.toml"
+    scene.write_text(scene.read_text("utf-8").replace("rest_s = 0.5", "rest_s = 0.75"), "utf-8")
+    assert run(campaign, folder) != 0
+    error = capsys.readouterr().err
+    assert "measured with another scene" in error
+    assert "--out" in error
+
+
+def test_a_recording_of_another_scene_is_not_adopted(tmp_path, campaign):
+    folder = tmp_path / "out"
+    assert run(campaign, folder) == 0
+    (folder / JOURNAL).unlink()
+    scene = tmp_path / "zero.toml"
+    scene.write_text(scene.read_text("utf-8").replace("rest_s = 0.5", "rest_s = 0.75"), "utf-8")
+    assert run(campaign, folder) == 0
+    recordings = {entry["key"]: entry["recording"] for entry in journal(folder)}
+    assert all(("~2" in name) == ("zero" in key) for key, name in recordings.items())
+
+
+def test_the_pressure_of_a_test_is_in_its_scene_whatever_the_scene_looks_like(tmp_path):
+    text = scene_text("sphere-60mm-low").replace("[protocol]", "  [ protocol ]  # as mounted")
+    (tmp_path / "s.toml").write_text(text.replace("initial_pressure_kPa", "  initial_pressure_kPa"), "utf-8")
+    (tmp_path / "c.toml").write_text(
+        'title = "c"\n[[test]]\nscene = "s.toml"\ninitial_pressures_kPa = [-1.5, 0.5]\n', "utf-8"
+    )
+    _, tests = load_campaign(tmp_path / "c.toml")
+    assert [test.scene.protocol.initial_pressure_kPa for test in tests] == [-1.5, 0.5]
+    assert all(parse_scene(test.scene_text, "again") == test.scene for test in tests)

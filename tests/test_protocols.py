@@ -9,10 +9,12 @@ import pytest
 from conftest import scene_text
 
 from analysis import analyze
+from drivers.emulated.chamber import ATMOSPHERE
 from drivers.emulated.electronics import Cell
 from rig.bench import load_bench, parse_bench
 from rig.calibrate import calibrate
 from rig.check import check
+from rig.cli import main
 from rig.errors import Refused
 from rig.observe import StepPhase, Watcher
 from rig.recording import load_recording, load_run
@@ -31,6 +33,7 @@ class Witness(Watcher):
         self.bench = None
         self.least_force = 0.0
         self.steps: list[str] = []
+        self.pressures: dict[str, float] = {}
 
     @property
     def truth(self):
@@ -42,6 +45,7 @@ class Witness(Watcher):
     def step(self, event):
         if event.phase is StepPhase.STARTED:
             self.steps.append(event.name)
+            self.pressures[event.name] = self.bench.plant.state.pressure
 
 
 @pytest.fixture
@@ -100,11 +104,16 @@ def test_the_volume_test_finds_the_chamber_volume(run, witness, seed):
     assert volume.uncertainty < 0.01 * volume.value
 
 
-def test_the_leak_test_finds_the_time_constant(run, witness):
-    path = run("leak", hold_s=60.0)
-    tau = analyze(load_run(path)).features["leak_time_constant_s"]
-    assert close(tau, witness.truth.chamber.leak_time)
-    assert tau.uncertainty < 0.3 * tau.value
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_leak_test_finds_the_time_constant_and_the_rate(run, witness, seed):
+    path = run("leak", hold_s=60.0, seed=seed)
+    features = analyze(load_run(path)).features
+    tau, rate = features["leak_time_constant_s"], features["leak_rate_Pa_s"]
+    chamber, pressure = witness.truth.chamber, witness.pressures["hold"]
+    truth = chamber.leak_time / (1 + pressure / ATMOSPHERE)  # the syringe has enlarged the gas volume by as much
+    assert close(tau, truth)
+    assert close(rate, -pressure / truth)
+    assert rate.uncertainty < 0.3 * rate.value
 
 
 @pytest.mark.parametrize("name", ["volume", "leak"])
@@ -237,3 +246,11 @@ def test_compliance_may_be_measured_on_a_bench_that_does_not_know_it_yet():
     new = bench.model_copy(update={"force": bench.force.model_copy(update={"compliance_um_per_N": 0.0})})
     check(parse_scene(scene_text("compliance"), "compliance"), new)
     assert "run the scene `compliance`" in refused("sphere-60mm-vented", bench=new)
+
+
+def test_rig_analyze_gives_the_lines_too_and_refuses_to_report_them(run, capsys):
+    path = run("pressure-zero", rest_s=0.5)
+    assert main(["analyze", str(path)]) == 0
+    assert "[pressure.zero]" in capsys.readouterr().out
+    assert main(["analyze", str(path), "--json"]) != 0
+    assert "is a calibration" in capsys.readouterr().err

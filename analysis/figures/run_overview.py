@@ -51,7 +51,13 @@ def overview_bytes(run: Run, analysis: Analysis, prediction: Prediction | None, 
 
 
 def draw_overview(figure: Figure, run: Run, analysis: Analysis, prediction: Prediction | None) -> None:
-    """Draw both panels into a figure."""
+    """Draw both panels into a figure: force and pressure of a test, the fit of a test of the chamber alone."""
+    from analysis.figures.fit_picture import chamber_picture, draw_fit
+
+    fit = chamber_picture(run, analysis)
+    if fit is not None:
+        draw_fit(figure, fit)
+        return
     above, below = figure.subplots(2, 1, height_ratios=[1, 1.25])
     draw_against_time(above, run, analysis)
     if analysis.curve is None:

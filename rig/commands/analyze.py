@@ -47,6 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
         from rig.errors import FileError
 
         raise FileError("no recording given. Remedy: name one or more .h5 files, or use --published")
+    if _calibrations(arguments):
+        return 0
     wants_pictures = arguments.report is not None or arguments.pdf is not None
     runs = analyze_files(
         arguments.recordings,
@@ -58,6 +60,24 @@ def run(arguments: argparse.Namespace) -> int:
     _write(arguments, runs)
     _print(arguments, runs)
     return 0
+
+
+def _calibrations(arguments: argparse.Namespace) -> bool:
+    """Print what calibration recordings give; return whether there was nothing else to analyse."""
+    from rig.calibrate import PROTOCOLS, calibrate
+    from rig.errors import FileError
+    from rig.recording import load_recording, protocol_of
+
+    found = [path for path in arguments.recordings if protocol_of(path) in PROTOCOLS]
+    if not found:
+        return False
+    options = ("json", "csv", "tables", "report", "pdf", "curves", "afm")
+    if any(getattr(arguments, name) for name in options):
+        raise FileError(f"{found[0]}: is a calibration, it has no features. Remedy: analyse it alone, without options.")
+    for path in found:
+        print(f"{path}\n{calibrate(load_recording(path))}")
+    arguments.recordings = [path for path in arguments.recordings if path not in found]
+    return not arguments.recordings
 
 
 def analyze_files(

@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.out or Path("recordings") / arguments.file.stem
     folder.mkdir(parents=True, exist_ok=True)
     journal = Journal(folder)
+    journal.check(tests)
     adopted = journal.adopt(tests, _is_whole)
     done = journal.done()
     todo = [test for test in tests if test.key not in done]
@@ -133,17 +134,19 @@ def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reaso
     if code:
         print(f"rig campaign: {test.key}: {reason}", file=sys.stderr)
     else:
-        journal.write(test.key, recording)
+        journal.write(test.key, recording, scene=test.digest)
     return code
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether the recording came to its end; one left by a crash is repaired and kept, but is not whole."""
+def _is_whole(path: Path, test: PlannedTest) -> bool:
+    """Whether the recording is of this test and came to its end; one left by a crash is kept, but is not whole."""
     from rig.errors import FileError
     from rig.recording import load_recording
 
     try:
-        ending = load_recording(path).ending
+        recording = load_recording(path)
     except FileError:
         return False
-    return ending is not None and ending[1] == 0
+    told = recording.configuration
+    same = told.get("scene") == test.scene_text and told.get("place", "") == test.place
+    return same and recording.ending is not None and recording.ending[1] == 0
