@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         entries = journal.done()
         files = [str(folder / entries[test.key]) for test in tests]
-        return main(["analyze", *files, "--report", str(arguments.report)])
+        return main(["analyze", *files, "--report", str(arguments.report), "--title", campaign.title])
     return 0
 
 
