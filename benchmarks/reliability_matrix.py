@@ -35,9 +35,9 @@ def main() -> None:
     arguments = parser.parse_args()
     deadline = time.monotonic() + 60 * arguments.minutes
     verdicts: list[Verdict] = []
-    numbers = range(len(cells()))
+    numbers = sorted(range(len(cells())), key=lambda number: cells()[number][1] != "preload")  # every fault once, first
     with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
-        for verdict in pool.imap(judged, numbers):
+        for verdict in pool.imap_unordered(judged, numbers):
             if isinstance(verdict, str):
                 print("FAILED", verdict, flush=True)
                 continue
@@ -48,6 +48,8 @@ def main() -> None:
                 print(len(verdicts), "cells", flush=True)
             if time.monotonic() > deadline:
                 break
+    order = {(trouble.title, step): number for number, (trouble, step) in enumerate(cells())}
+    verdicts.sort(key=lambda verdict: order[verdict.trouble, verdict.step])
     PAGE.write_text(page(verdicts), encoding="utf-8")
     print(f"{len(verdicts)} cells, {sum(not verdict.flaws for verdict in verdicts)} without a flaw")
 

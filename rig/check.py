@@ -23,7 +23,7 @@ RESOLUTION = 10.0
 """A preload is worth setting if it is so many times what the load cell is known to."""
 
 REACTION_S = 0.03
-"""From the end of a frame to the stop byte at the stage: p99 on a loaded computer (docs/reliability.md)."""
+"""From the end of a frame to the stop byte at the stage: assumed; docs/reliability.md says how to measure it."""
 
 SLOW_UM_S = 20.0
 """Slow enough to press a rigid stop with a load train whose compliance nobody knows yet."""
