@@ -5,7 +5,6 @@ EML 2020 Fig. 2c; speeds and preload from its section 2. Forces are counted from
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 

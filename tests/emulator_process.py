@@ -1,8 +1,8 @@
 """The emulated bench in real time, in a process of its own, which keeps the plant's truth: run as a script.
 
 Prints its endpoints as one line of JSON, then obeys what it reads: ``trip N`` lets the force pass its limit N samples
-from now, ``clear`` ends that, anything else makes it print its log and end. A row of the log is (monotonic time, samples,
-height m, volume displaced m^3, least and greatest true force N since the row before). Besides, it tells the samples of
+from now, ``clear`` ends that, anything else makes it print its log and end. A row of the log is (monotonic time,
+samples, height m, volume displaced m^3, least and greatest true force N since the row before). Besides, it tells the samples of
 the trips, and when the stage's stop bytes came in.
 """
 

@@ -50,6 +50,7 @@ def synthetic(name: str) -> Run:
 def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     """Files that stand for recordings; what they hold comes from ``synthetic``."""
     monkeypatch.setattr("rig.recording.load_run", lambda path: synthetic(path.stem))
+    monkeypatch.setattr("rig.recording.protocol_of", lambda path: "pull_off")
     paths = [tmp_path / f"{name}.h5" for name in ("first", "second", "aborted")]
     for path in paths:
         path.write_bytes(path.stem.encode())
