@@ -2,8 +2,8 @@
 
 Prints its endpoints as one line of JSON, then obeys what it reads: ``trip N`` lets the force pass its limit N samples
 from now, ``clear`` ends that, anything else makes it print its log and end. A row of the log is (monotonic time,
-samples, height m, volume displaced m^3, least and greatest true force N since the row before). Besides, it tells the samples of
-the trips, and when the stage's stop bytes came in.
+samples, height m, volume displaced m^3, least and greatest true force N since the row before). Besides, it tells the
+samples of the trips, and when the stage's stop bytes came in.
 """
 
 from __future__ import annotations
