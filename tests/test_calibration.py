@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.calibration import Calibration, InvalidCalibration
@@ -105,6 +105,7 @@ values = st.one_of(
 )
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # the first strings of a process take seconds
 @given(st.dictionaries(st.sampled_from([*RECORD, "digest", "unit", "other"]), values))
 def test_no_table_of_a_file_makes_anything_but_a_record_or_one_clear_error(table: dict[str, Any]) -> None:
     try:

@@ -49,7 +49,7 @@ def test_every_fault_in_every_step(cell, tmp_path, verdicts):
 
 
 def test_the_matrix_knows_every_fault_of_the_emulators():
-    from rig.commands.emulate import known_faults
+    from rig.fault_script import known_faults
 
     played = {(device, kind) for trouble in troubles() for device, kind, _ in trouble.faults}
     left = {(device, kind) for device, kinds in known_faults().items() for kind in kinds} - played
