@@ -127,6 +127,28 @@ def test_both_back_ends_deliver_the_same_bits():
     assert pumped == wired_pumped
 
 
+@pytest.mark.parametrize(
+    "code", [-200284, -200279, -200361, -88709, -201003, -200170, -200220, -50103, -200022, -200077, -12345]
+)
+def test_an_error_of_the_daq_is_the_same_over_the_wire_and_directly(code):
+    from drivers.daq import NIDaq
+
+    raised = []
+    for wire in (False, True):
+        faults = Faults()
+        with EmulatedBench(Truth.pull_off(), wire=wire, referenced=True, faults=faults) as bench:
+            channel = VoltageChannel("force", "Dev1/ai0")
+            daq = NIDaq([channel], rate=1000.0, connection=bench.endpoints.daq) if wire else bench.daq("force")
+            daq.start()
+            faults.add(Fault("daq", "error_code", value=code))
+            with pytest.raises(DeviceError) as failure:
+                daq.read(20)
+            raised.append((type(failure.value), failure.value.device))
+            faults.clear()
+            daq.close()
+    assert raised[0] == raised[1]
+
+
 # Stage
 
 

@@ -1,14 +1,13 @@
 """The pump driver against the emulated pump, over TCP and a pseudo-terminal, and against nonsense."""
 
 import contextlib
-import sys
 import threading
-import time
 
 import pytest
 from dialogue import flood
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from links import PTY, TERMINALS, BabblingPort, believed, outcomes, stopping, wait_until
 from motion_world import MotionWorld
 
 import drivers.pump
@@ -18,8 +17,6 @@ from drivers.emulated.stage import EmulatedController
 from drivers.errors import BadReply, CommandRefused, DeviceError, MotionFault, NoReply, NotConnected, WrongDevice
 from drivers.interfaces import PumpState
 from drivers.pump import LegatoPump
-
-PTY = pytest.param(serve_pty, marks=pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX"))
 
 
 def connect(url, **options):
@@ -182,20 +179,11 @@ def wait_for_stop(pump):
 
 
 def test_stops_from_another_thread_never_mix_up_replies(pump, world):
-    done = threading.Event()
-
-    def stop():
-        for _ in range(100):
-            pump.stop()
-        done.set()
-
-    thread = threading.Thread(target=stop)
-    thread.start()
-    while not done.is_set():
-        low, high = pump._read_limits()
-        assert low < high
-        assert pump.status().state is PumpState.IDLE
-    thread.join()
+    with stopping(pump.stop) as done:
+        while not done.is_set():
+            low, high = pump._read_limits()
+            assert low < high
+            assert pump.status().state is PumpState.IDLE
     assert not pump._awaited
 
 
@@ -245,7 +233,7 @@ def test_a_second_program_is_refused(pump, server):
     assert pump.status().state is PumpState.IDLE
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")
+@TERMINALS
 def test_a_second_program_on_the_serial_port_is_refused(legato):
     with serve_pty(legato) as server:
         pump = connect(server.url)
@@ -336,34 +324,23 @@ def test_a_pump_that_has_restarted_is_not_run_with_the_settings_it_woke_up_with(
 @pytest.mark.parametrize("kind", ["silent", "slow", "late", "garbage"])
 def test_no_stale_reply_is_ever_believed(pump, world, kind):
     pump.dispense(10e-6, 100e-9)
-    believed = 0
-    for attempt in range(12):
-        if attempt == 1:
-            world.fail("pump", kind, 0.25)
-        if attempt == 4:
-            world.faults.clear()
+
+    def poll():
         world.pass_time(0.1)
-        try:
-            status = pump.status()
-        except (NoReply, BadReply):
-            continue
-        believed += 1
+        return pump.status()
+
+    volumes = 0
+    for status in believed(poll, lambda: world.fail("pump", kind, 0.25), world.faults, last=4):
+        volumes += 1
         assert status.volume == pytest.approx(world.syringe.volume, rel=1e-6)
-    assert believed >= 5
+    assert volumes >= 5
 
 
 # ---------------------------------------------------------------- nonsense
 
 
-class BabblingPort:
-    """Answers every write with the next of the given replies, at once."""
-
-    def __init__(self, replies):
-        self._replies = iter(replies)
-        self._pending = b""
-
-    def write(self, data):
-        self._pending += next(self._replies, b"")
+class BabblingPump(BabblingPort):
+    """Read as pyserial reads."""
 
     def read_until(self, expected, size):
         data, found, self._pending = self._pending.partition(expected)
@@ -376,9 +353,6 @@ class BabblingPort:
     def read(self, size):
         data, self._pending = self._pending[:size], self._pending[size:]
         return data
-
-    def close(self):
-        pass
 
 
 OK = b"\n:\x11"
@@ -420,7 +394,7 @@ CALLS = st.lists(
 def babble(replies):
     patch = pytest.MonkeyPatch()
     with patch.context() as context:
-        context.setattr(drivers.pump, "open_port", lambda connection, baud, timeout: BabblingPort(replies))
+        context.setattr(drivers.pump, "open_port", lambda connection, baud, timeout: BabblingPump(replies))
         return connect("fake")
 
 
@@ -441,21 +415,6 @@ def test_connecting_to_nonsense_is_a_device_error(replies):
 @given(REPLIES, CALLS)
 def test_nonsense_in_operation_is_a_device_error_or_a_finite_volume(replies, calls):
     pump = babble(GOOD_START + replies)
-    for call in calls:
-        try:
-            result = call(pump)
-        except DeviceError as error:
-            assert error.device == "pump"
-            assert error.remedy
-        else:
-            if call is LegatoPump.status:
-                assert abs(result.volume) < float("inf")
-
-
-def wait_until(condition):
-    """Wait for another thread's doing."""
-    for _ in range(10_000):
-        if condition():
-            return
-        time.sleep(1e-3)
-    raise AssertionError("the condition never came true")
+    for call, result in outcomes(pump, "pump", calls):
+        if call is LegatoPump.status:
+            assert abs(result.volume) < float("inf")

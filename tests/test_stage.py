@@ -1,14 +1,13 @@
 """The stage driver against the emulated controller, over TCP and a pseudo-terminal, and against nonsense."""
 
 import contextlib
-import sys
 import threading
-import time
 
 import pytest
 from dialogue import flood
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from links import PTY, TERMINALS, BabblingPort, believed, outcomes, stopping, wait_until
 from motion_world import MotionWorld
 
 import drivers.gateway
@@ -25,8 +24,6 @@ from drivers.errors import (
     WrongDevice,
 )
 from drivers.stage import PIStage
-
-PTY = pytest.param(serve_pty, marks=pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX"))
 
 
 @pytest.fixture
@@ -147,18 +144,9 @@ def test_no_move_slips_through_between_check_and_stop(stage, world, controller, 
 
 def test_stop_from_another_thread_is_no_fault_of_the_controller(stage, world):
     stage.move_to(40e-3)
-    done = threading.Event()
-
-    def stop():
-        for _ in range(100):
-            stage.stop()
-        done.set()
-
-    thread = threading.Thread(target=stop)
-    thread.start()
-    while not done.is_set():
-        stage.status()
-    thread.join()
+    with stopping(stage.stop) as done:
+        while not done.is_set():
+            stage.status()
     assert not world.axis.moving or world.axis.target < 40e-3
 
 
@@ -221,7 +209,7 @@ def test_a_second_program_is_refused(stage, server):
     assert stage.referenced
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")
+@TERMINALS
 def test_a_second_program_on_the_serial_port_is_refused(controller):
     with serve_pty(controller) as server:
         stage = PIStage(server.url)
@@ -346,20 +334,16 @@ def test_no_stale_reply_is_ever_believed(stage, world, kind):
     """While replies go astray and afterwards, a position that is returned is the present one."""
     stage.set_speed(5e-3)
     stage.move_to(50e-3)
-    believed = 0
-    for attempt in range(12):
-        if attempt == 1:
-            world.fail("stage", kind, 0.25)
-        if attempt == 5:
-            world.faults.clear()
+
+    def poll():
         world.pass_time(0.1)
-        try:
-            status = stage.status()
-        except (NoReply, BadReply):
-            continue
-        believed += 1
+        return stage.status()
+
+    positions = 0
+    for status in believed(poll, lambda: world.fail("stage", kind, 0.25), world.faults, last=5):
+        positions += 1
         assert status.position == pytest.approx(world.axis.position, abs=1e-7)
-    assert believed >= 4
+    assert positions >= 4
 
 
 def test_stop_reaches_a_controller_whose_replies_are_lost(stage, world):
@@ -380,7 +364,7 @@ def test_unplugged_cable_is_noticed_by_every_call(stage, world):
         stage.emergency_stop()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")
+@TERMINALS
 def test_serial_adapter_pulled_out(world, controller):
     with serve_pty(controller) as server:
         stage = PIStage(server.url, reply_timeout=0.2)
@@ -396,15 +380,8 @@ def test_serial_adapter_pulled_out(world, controller):
 # ---------------------------------------------------------------- nonsense
 
 
-class BabblingPort:
-    """Answers every question with the next of the given replies, at once."""
-
-    def __init__(self, replies):
-        self._replies = iter(replies)
-        self._pending = b""
-
-    def write(self, data):
-        self._pending += next(self._replies, b"")
+class BabblingController(BabblingPort):
+    """Read as the gateway reads."""
 
     def read(self, timeout):
         data, self._pending = self._pending, b""
@@ -412,9 +389,6 @@ class BabblingPort:
 
     def drain(self):
         self._pending = b""
-
-    def close(self):
-        pass
 
 
 PLAUSIBLE = st.sampled_from(
@@ -457,7 +431,7 @@ CALLS = st.lists(
 def connect(replies):
     patch = pytest.MonkeyPatch()
     with patch.context() as context:
-        context.setattr(drivers.gateway, "open_port", lambda connection, baud: BabblingPort(replies))
+        context.setattr(drivers.gateway, "open_port", lambda connection, baud: BabblingController(replies))
         return PIStage("fake")
 
 
@@ -478,15 +452,9 @@ def test_connecting_to_nonsense_is_a_device_error(replies):
 @given(REPLIES, CALLS)
 def test_nonsense_in_operation_is_a_device_error_or_a_finite_position(replies, calls):
     stage = connect(GOOD_START + replies)
-    for call in calls:
-        try:
-            result = call(stage)
-        except DeviceError as error:
-            assert error.device == "stage"
-            assert error.remedy
-        else:
-            if call is PIStage.status:
-                assert abs(result.position) < float("inf")
+    for call, result in outcomes(stage, "stage", calls):
+        if call is PIStage.status:
+            assert abs(result.position) < float("inf")
 
 
 @settings(deadline=None)
@@ -498,12 +466,3 @@ def test_no_float_leaves_the_travel(position):
     else:
         with pytest.raises(OutOfRange):
             stage.move_to(position)
-
-
-def wait_until(condition):
-    """Wait for another thread's doing."""
-    for _ in range(10_000):
-        if condition():
-            return
-        time.sleep(1e-3)
-    raise AssertionError("the condition never came true")

@@ -21,7 +21,6 @@ from drivers.emulated.world import World
 from drivers.errors import (
     BadReply,
     CommandRefused,
-    DataLost,
     DeviceError,
     MotionFault,
     NoReply,
@@ -371,12 +370,7 @@ class DirectDaq:
 
 
 def _error_of(refusal: Refusal) -> DeviceError:
-    """The rig's error for a DAQmx error code, as ``drivers.daq_errors`` maps it."""
-    from drivers.daq_errors import DEVICE_GONE, NO_SUCH_DEVICE, SAMPLES_LOST
+    """The rig's error for a DAQmx error code, the same as over the wire."""
+    from drivers.daq_errors import daqmx_error
 
-    message = f"DAQmx error {refusal.code}: {refusal}"
-    if refusal.code in SAMPLES_LOST:
-        return DataLost("daq", message, REMEDY)
-    if refusal.code in DEVICE_GONE | NO_SUCH_DEVICE:
-        return NotConnected("daq", message, REMEDY)
-    return CommandRefused("daq", message, REMEDY)
+    return daqmx_error(refusal.code, str(refusal))
