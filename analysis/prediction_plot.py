@@ -17,7 +17,7 @@ def draw_prediction(prediction: Prediction, title: str, path: Path) -> None:
 
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     axes = figure.subplots()
-    axes.set_title(f"{title} - {prediction.model}")
+    axes.set_title(f"{title} - {prediction.label}")
     axes.set_xlabel("retraction $z_r$ (mm)")
     axes.set_ylabel("reaction force $F_r$ (N), compression positive", color=FORCE)
     if prediction.position.size == 0:

@@ -8,13 +8,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from model.errors import InvalidParameter, ModelError, NotConverged, UnsupportedScene
-from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
+from model.parameters import ContactStretch, Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
 
 if TYPE_CHECKING:
     from model.prediction import Prediction
 
 __all__ = [
     "MODELS",
+    "ContactStretch",
     "Gas",
     "GasAnchor",
     "Gripper",
@@ -31,6 +32,11 @@ __all__ = [
 MODELS = ("cone", "cone-2017", "membrane")
 """Names of the adhesion models, as the command line takes them."""
 
+_FIXED_STRETCH = (
+    "model {!r} has no choice of contact stretch: the cone stores W_2 of EML Eq. 5 in contact, cone-2017 nothing; "
+    "choose the model 'membrane' for another assumption"
+)
+
 
 def predict(
     parameters: Parameters, model: str = "cone", *, points: int = 200, contact_stretch: str | None = None
@@ -46,16 +52,18 @@ def predict(
     points
         Number of points of the returned profile; the features do not depend on it.
     contact_stretch
-        How the membrane is stretched in contact, for ``membrane`` only: see ``model.membrane_contact``.
+        How the membrane is stretched in contact, for ``membrane`` only: see ``ContactStretch`` (default: ``eml``).
 
     Raises
     ------
     InvalidParameter
-        A parameter lies outside its physical range, or the model is unknown.
+        A parameter lies outside its physical range, the model is unknown or leaves no choice of contact stretch.
     NotConverged
         The solver could not bound its error.
     """
     if model in ("cone", "cone-2017"):
+        if contact_stretch is not None:
+            raise InvalidParameter(_FIXED_STRETCH.format(model))
         from model import cone
 
         return cone.solve(parameters, contact_stretch=model == "cone", points=points)

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from model.errors import InvalidParameter, NotConverged
 from model.membrane_branch import Counter, Line, near_branch, pinned_state, release_branch
-from model.membrane_contact import Contact, ContactStretch, Surface, frozen
+from model.membrane_contact import Contact, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
 from model.membrane_equilibrium import solve as solve_states
 from model.membrane_path import Features, Memory, Piece, Place, Resolution, features, path, peel_panels, pinned_panels
-from model.parameters import GasAnchor, Parameters
+from model.parameters import ContactStretch, GasAnchor, Parameters
 from model.prediction import Jump, Outcome, Prediction
 from model.start import check, start_position, start_radius
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import NotConverged
-from model.membrane_contact import ContactStretch, Surface, frozen
+from model.membrane_contact import Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Solved, relative_size, release_slope, shape, solve, strip
+from model.parameters import ContactStretch
 
 Array = NDArray[np.float64]
 

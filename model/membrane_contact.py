@@ -8,30 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.membrane_material import energy, respond
+from model.parameters import ContactStretch
 
 Array = NDArray[np.float64]
-
-
-class ContactStretch(StrEnum):
-    """How the membrane is stretched where it is in contact. On a flat all but ``FRICTIONLESS`` agree."""
-
-    EML = "eml"
-    """W_2 of EML Eq. 5: every point keeps its radius; stored is the energy of one mean meridional stretch."""
-    PROJECTED = "projected"
-    """Perfect stick, every point vertically below its place in the flat membrane."""
-    UNSTRETCHED = "unstretched"
-    """Every point keeps its radius, nothing is stored (SI Eq. S8)."""
-    LOADING = "loading"
-    """Perfect stick, every point with the stretch it had when the line passed it in vented loading without adhesion."""
-    FRICTIONLESS = "frictionless"
-    """The membrane slides on the substrate: its tension along the substrate is continuous at the line."""
 
 
 @dataclass(frozen=True, slots=True)

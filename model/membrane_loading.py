@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from model.errors import NotConverged
 from model.membrane_branch import Counter, follow
-from model.membrane_contact import ContactStretch, Frozen, Line, Surface, flat_line, frozen
+from model.membrane_contact import Frozen, Line, Surface, flat_line, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, node_positions, relative_size, resample, solve
 from model.membrane_material import energy, respond
+from model.parameters import ContactStretch
 
 Array = NDArray[np.float64]
 

@@ -29,6 +29,21 @@ class GasAnchor(StrEnum):
     """The measured P_a drives the model; see ``Gas.measured``."""
 
 
+class ContactStretch(StrEnum):
+    """How the membrane is stretched where it is in contact. On a flat all but ``FRICTIONLESS`` agree."""
+
+    EML = "eml"
+    """W_2 of EML Eq. 5: every point keeps its radius; stored is the energy of one mean meridional stretch."""
+    PROJECTED = "projected"
+    """Perfect stick, every point vertically below its place in the flat membrane."""
+    UNSTRETCHED = "unstretched"
+    """Every point keeps its radius, nothing is stored (SI Eq. S8)."""
+    LOADING = "loading"
+    """Perfect stick, every point with the stretch it had when the line passed it in vented loading without adhesion."""
+    FRICTIONLESS = "frictionless"
+    """The membrane slides on the substrate: its tension along the substrate is continuous at the line."""
+
+
 @dataclass(frozen=True, slots=True)
 class Substrate:
     """What the membrane sticks to.

@@ -98,6 +98,13 @@ class Prediction:
     evaluations: Mapping[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
+    @property
+    def label(self) -> str:
+        """The model, with what it assumes of the contact where that was a choice."""
+        if self.model != "membrane":
+            return self.model
+        return f"{self.model}, contact stretch {self.assumptions['contact stretch']}"
+
     def frame(self) -> pd.DataFrame:
         """Return the profile as a DataFrame with units in the column names."""
         import pandas as pd

@@ -12,9 +12,10 @@ import pandas as pd
 import pytest
 
 from analysis.sweep import sweep
-from model import Gas, Membrane, Parameters, Substrate, cone
+from model import Gas, InvalidParameter, Membrane, Parameters, Substrate, cone, predict
 from rig.cli import main
 from rig.commands.sweep import parse_axis
+from rig.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 FLAT = ROOT / "scenes" / "flat-high.toml"
@@ -92,6 +93,33 @@ def test_impossible_requests_are_refused(capsys, words, said):
     code, out, err = run(capsys, "predict", FLAT, *words)
     assert (code, out) == (2, "")
     assert said in err
+
+
+def test_contact_stretch_of_the_membrane_is_a_choice_and_is_named(capsys, tmp_path):
+    words = ("predict", SPHERE, "--model", "membrane")
+    answers = {}
+    for choice in ("eml", "projected"):
+        code, out, _ = run(capsys, *words, "--contact-stretch", choice, "--json")
+        answers[choice] = json.loads(out)
+        assert code == 0
+        assert answers[choice]["assumptions"]["contact stretch"] == choice
+    assert answers["projected"]["pull_off_force_N"] < 0.99 * answers["eml"]["pull_off_force_N"]
+    default = json.loads(run(capsys, *words, "--json")[1])
+    assert default["pull_off_force_N"] == answers["eml"]["pull_off_force_N"]
+    code, out, _ = run(capsys, *words, "--contact-stretch", "frictionless", "--plot", tmp_path / "plot.png")
+    assert code == 0
+    assert out.splitlines()[0].endswith("(membrane, contact stretch frictionless)")
+    assert (tmp_path / "plot.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("model", ["cone", "cone-2017"])
+def test_contact_stretch_is_refused_where_the_model_has_none(capsys, model):
+    code, out, err = run(capsys, "predict", SPHERE, "--model", model, "--contact-stretch", "projected")
+    assert (code, out) == (2, "")
+    assert f"--contact-stretch projected: --model {model}" in err
+    assert "--model membrane" in err
+    with pytest.raises(InvalidParameter, match=f"{model}.*contact stretch"):
+        predict(load_scene(SPHERE).parameters(), model, contact_stretch="projected")
 
 
 @pytest.mark.parametrize(

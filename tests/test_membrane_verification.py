@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.membrane_branch import Counter, release_branch, release_state
-from model.membrane_contact import ContactStretch, Frozen, Line, Surface, frozen
+from model.membrane_contact import Frozen, Line, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, residual_and_jacobian, shape, solve, strip
 from model.membrane_loading import loading_contact
 from model.membrane_material import energy as stored_energy

@@ -16,9 +16,9 @@ from analysis.accuracy.section import Progress, Section
 from analysis.accuracy.timing import Timing, timed
 from model import Gas, GasAnchor, Gripper, Membrane, ModelError, Parameters, Substrate, membrane
 from model.membrane_branch import Counter, release_state
-from model.membrane_contact import ContactStretch
 from model.membrane_equilibrium import resample, shape, solve
 from model.membrane_path import Memory
+from model.parameters import ContactStretch
 
 FLAT = Parameters(Substrate("flat"), gas=Gas(-1000.0))
 SPHERE = Parameters(Substrate("sphere", 60e-3), gas=Gas(-3200.0))

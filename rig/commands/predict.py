@@ -27,10 +27,15 @@ PROFILE = {"retraction": "m", "force": "N", "pressure": "Pa", "contact_radius": 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    from model import MODELS
+    from model import MODELS, ContactStretch
 
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
     parser.add_argument("--model", choices=MODELS, default="cone", help="adhesion model (default: cone)")
+    parser.add_argument(
+        "--contact-stretch",
+        choices=[choice.value for choice in ContactStretch],
+        help="how the membrane is stretched in contact, for --model membrane (default: eml)",
+    )
     parser.add_argument("--pressure-kpa", type=float, metavar="X", help="initial pressure P_0 instead of the scene's")
     parser.add_argument("--points", type=int, default=200, metavar="N", help="points of the profile (default: 200)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -52,6 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         scene,
         str(arguments.scene),
         model=arguments.model,
+        contact_stretch=arguments.contact_stretch,
         pressure_kPa=arguments.pressure_kpa,
         points=arguments.points,
         rigid_bound=arguments.rigid_bound,
@@ -72,6 +78,7 @@ def predict_scene(
     source: str,
     *,
     model: str = "cone",
+    contact_stretch: str | None = None,
     pressure_kPa: float | None = None,
     points: int = 200,
     rigid_bound: bool = False,
@@ -81,7 +88,7 @@ def predict_scene(
     Raises
     ------
     FileError
-        The scene is physically impossible.
+        The scene is physically impossible, or the model has no choice of contact stretch.
     UnsupportedScene
         The papers hold no adhesion model for this gripper.
     """
@@ -93,8 +100,13 @@ def predict_scene(
     bound = refuse_unmodelled(scene, source, rigid_bound=rigid_bound)
     if points < 16:
         raise FileError(f"--points {points}: a profile needs at least 16 points")
+    if contact_stretch is not None and model != "membrane":
+        raise FileError(
+            f"--contact-stretch {contact_stretch}: --model {model} has no such assumption to choose. "
+            "Remedy: add --model membrane, or leave the option out."
+        )
     try:
-        prediction = predict(scene.parameters(pressure_kPa), model, points=points)
+        prediction = predict(scene.parameters(pressure_kPa), model, points=points, contact_stretch=contact_stretch)
     except InvalidParameter as error:
         raise FileError(f"scene {source}: {error}") from error
     if bound:
@@ -158,7 +170,7 @@ def number(value: float) -> float | None:
 
 def as_text(prediction: Prediction, title: str, *, profile: bool) -> str:
     """Return the answer in words, lengths in mm."""
-    lines = [f"{title}: {prediction.outcome.value} ({prediction.model})"]
+    lines = [f"{title}: {prediction.outcome.value} ({prediction.label})"]
     if math.isfinite(prediction.pull_off_force):
         error = prediction.numerical_error
         lines += [
