@@ -7,7 +7,7 @@ apart from the calibration. Compression is positive, tension (adhesion, a hung w
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -54,6 +54,8 @@ class LoadCell:
     minimum: float = -10.0
     maximum: float = 10.0
     compression_positive: bool = True
+    _sound: tuple[float, float] = field(init=False, repr=False, compare=False)
+    """Recorded values in between need no closer look."""
 
     def __post_init__(self) -> None:
         if self.calibration.unit != "N":
@@ -66,6 +68,7 @@ class LoadCell:
             raise ValueError(f"{self.name}: capacity {self.capacity} N must be positive")
         if not self.minimum < self.maximum:
             raise ValueError(f"{self.name}: minimum {self.minimum} is not below maximum {self.maximum}")
+        object.__setattr__(self, "_sound", self._find_sound())
 
     @classmethod
     def gso(
@@ -90,23 +93,24 @@ class LoadCell:
 
     def convert(self, recorded: Array) -> Reading:
         """Return the untared force (n,) in N and what was wrong; sample by sample, so frames may be cut anyhow."""
-        return Reading(self._force(recorded), self._check(recorded))
+        if not recorded.size:
+            return Reading(np.empty(0), SensorFlags.NONE)
+        low, high = float(np.minimum.reduce(recorded)), float(np.maximum.reduce(recorded))
+        if self._sound[0] < low and high < self._sound[1]:
+            return Reading(self._force(recorded), SensorFlags.NONE)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return Reading(self._force(recorded), self._check(low, high))
 
     def _force(self, recorded: Array) -> Array:
         sign = 1.0 if self.compression_positive else -1.0
-        with np.errstate(over="ignore"):
-            force: Array = recorded * (sign * self.calibration.slope) + sign * self.calibration.intercept
+        force: Array = recorded * (sign * self.calibration.slope) + sign * self.calibration.intercept
         return force
 
-    def _check(self, recorded: Array) -> SensorFlags:
+    def _check(self, low: float, high: float) -> SensorFlags:
         """The extremes tell everything: the conversion is a straight line."""
-        if not recorded.size:
-            return SensorFlags.NONE
-        extremes = np.array([np.minimum.reduce(recorded), np.maximum.reduce(recorded)])
-        low, high = extremes.tolist()
         if not (math.isfinite(low) and math.isfinite(high)):
             return SensorFlags.INVALID
-        load = max(map(abs, self._force(extremes).tolist())) / self.capacity
+        load = max(map(abs, self._force(np.array([low, high])).tolist())) / self.capacity
         flags = SensorFlags.NONE
         for limit, flag in _LOADS:
             if load > limit:
@@ -114,3 +118,9 @@ class LoadCell:
         if low <= self.minimum or high >= self.maximum:
             flags |= SensorFlags.CLIPPED
         return flags
+
+    def _find_sound(self) -> tuple[float, float]:
+        """Return the recorded values between which the load is below the first limit and the rails are not touched."""
+        most = (1 - 1e-9) * _LOADS[0][0] * self.capacity
+        ends = [(load - self.calibration.intercept) / self.calibration.slope for load in (-most, most)]
+        return max(min(ends), self.minimum), min(max(ends), self.maximum)

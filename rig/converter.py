@@ -41,5 +41,6 @@ class SensorConverter:
         SensorFault
             Names the sensor, what is wrong and the remedy.
         """
-        raise_for("load cell", self._force_flags)
-        raise_for("pressure sensor", self._pressure_flags)
+        if self._force_flags or self._pressure_flags:
+            raise_for("load cell", self._force_flags)
+            raise_for("pressure sensor", self._pressure_flags)

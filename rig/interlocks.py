@@ -59,7 +59,7 @@ class Interlocks:
 
     def check_signals(self, force: Array, pressure: Array | None) -> None:
         """Check what the sensors say; called before anything else is done with a frame."""
-        high, low = float(force.max()), float(force.min())
+        high, low = _extremes(force)
         if not (high <= self.limits.compression and low >= -self.limits.tension):
             worst = high if high > self.limits.compression else low
             limit = self.limits.compression if worst > 0 else -self.limits.tension
@@ -70,8 +70,9 @@ class Interlocks:
         if pressure is None or self.limits.pressure is None:
             return
         lowest, highest = self.limits.pressure
-        if not (float(pressure.min()) >= lowest and float(pressure.max()) <= highest):
-            worst = float(pressure.min()) if float(pressure.min()) < lowest else float(pressure.max())
+        high, low = _extremes(pressure)
+        if not (low >= lowest and high <= highest):
+            worst = low if low < lowest else high
             raise Interlock(
                 f"pressure {worst / 1e3:+.2f} kPa has left {lowest / 1e3:+g} to {highest / 1e3:+g} kPa. "
                 "Remedy: open the vent, check the tubing and the sensor's supply."
@@ -90,3 +91,8 @@ class Interlocks:
                 f"data come {lag:.2f} s late, {self.limits.lag:g} s are allowed. "
                 "Remedy: close other programs on this computer or lengthen frame_ms in the bench."
             )
+
+
+def _extremes(values: Array) -> tuple[float, float]:
+    """Return the highest and the lowest value, NaN if there is one."""
+    return float(np.maximum.reduce(values)), float(np.minimum.reduce(values))

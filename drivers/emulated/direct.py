@@ -43,6 +43,8 @@ MOVING, REFERENCING, ON_TARGET = 1 << 13, 1 << 14, 1 << 15
 def check_wire(world: World, device: str) -> None:
     """Raise what a driver would if the fault script has hurt the wire to this instrument."""
     faults = world.faults
+    if not faults.scheduled:
+        return
     if faults.active(device, "unplugged"):
         raise NotConnected(device, "the connection has been closed by the far end", REMEDY)
     if faults.active(device, "silent"):
@@ -133,8 +135,7 @@ class DirectStage:
             Another error is pending in the controller.
         """
         sent = self._clock()
-        word = self._status_word()
-        position = self._scale * self._number("POS?")
+        word, position = self._poll()
         received = self._clock()
         error = int(self._ask("ERR?")) if word & ERROR else 0
         self._check_health(word, error)
@@ -142,7 +143,7 @@ class DirectStage:
         return StageStatus(
             sent=sent,
             received=received,
-            position=position,
+            position=self._scale * position,
             moving=bool(word & (MOVING | REFERENCING)),
             on_target=bool(word & ON_TARGET),
             servo_on=bool(word & SERVO_ON),
@@ -185,6 +186,13 @@ class DirectStage:
 
     def close(self) -> None:
         """Nothing to release."""
+
+    def _poll(self) -> tuple[int, float]:
+        check_wire(self._world, "stage")
+        answer = self._controller.poll()
+        if answer is None:
+            raise NoReply("stage", "the controller is restarting", REMEDY)
+        return answer
 
     def _status_word(self) -> int:
         check_wire(self._world, "stage")

@@ -133,12 +133,16 @@ class Carriage:
         self._before_change = before_change
         self._trajectory = rest(clock(), position)
         self._blocked: float | None = None
+        self._seen = (math.nan, math.nan)
         self._offsets = self._follow(position)
 
     @property
     def position(self) -> float:
         """True position now, m."""
-        return self.position_at(self._clock())
+        now = self._clock()
+        if self._seen[0] != now:
+            self._seen = now, self.position_at(now)
+        return self._seen[1]
 
     @property
     def commanded(self) -> float:
@@ -223,6 +227,7 @@ class Carriage:
         """The decaying part of the lagging position at the start of each segment, from its present value."""
         offsets = []
         lag = self._lag
+        self._seen = (math.nan, math.nan)
         self._still_from = self._trajectory[-1].start + FORGOTTEN * lag
         following = self._trajectory[1:]
         for index, segment in enumerate(self._trajectory):

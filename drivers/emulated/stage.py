@@ -222,6 +222,15 @@ class EmulatedController:
                 return None
             return reply if addressed is None else f"0 {addressed} {reply}"
 
+    def poll(self) -> tuple[int, float] | None:
+        """Return what ``#4`` and ``POS?`` say, without writing and reading the words: status, and position in mm."""
+        with self._world.lock:
+            self._catch_up()
+            if self._is_deaf:
+                return None
+            self.received.update(("#4", "POS?"))
+            return self._status(), float(shown(self._position))
+
     def _strip_address(self, words: list[str]) -> tuple[int | None, list[str]]:
         """Split ``addr [0] COMMAND ...``; lines for another controller are dropped."""
         if not words or not words[0].isdecimal():
@@ -278,8 +287,7 @@ class EmulatedController:
             self._latch(int(fault.value) or UNKNOWN_COMMAND)
         if self._wire.fault("servo_lost"):
             self._drop_servo()
-        following_error = abs(axis.commanded - axis.position) * 1e3
-        if self._servo and (self._held_fast or following_error > self._number(0x8)):
+        if self._servo and (self._held_fast or self._following_error > self._number(0x8)):
             self._drop_servo()
             self._latch(MOTION_ERROR)
         self._watch_switches()
@@ -287,6 +295,11 @@ class EmulatedController:
             self._referencing.pop(0)[1]()
             self._start_referencing()
         self._watch_settling()
+
+    @property
+    def _following_error(self) -> float:
+        """How far the carriage lags behind its trajectory, mm."""
+        return abs(self._world.axis.commanded - self._world.axis.position) * 1e3
 
     @property
     def _held_fast(self) -> bool:
@@ -300,11 +313,14 @@ class EmulatedController:
 
     def _watch_switches(self) -> None:
         axis = self._world.axis
-        position, velocity = axis.position, axis.velocity
+        position = axis.position
         pressed = (0b001 if position <= self._switches[0] else 0) | (0b100 if position >= self._switches[1] else 0)
         if fault := self._wire.fault("limit_switch"):
             pressed |= self._pressed or (0b100 if (fault.value or axis.target - position) > 0 else 0b001)
         newly, self._pressed = pressed & ~self._pressed, pressed
+        if not pressed:
+            return
+        velocity = axis.velocity
         heads_in = (pressed & 0b001 and velocity < 0) or (pressed & 0b100 and velocity > 0)
         if (newly or heads_in) and axis.moving and not self._referencing:
             axis.halt(math.inf)
