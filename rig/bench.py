@@ -127,6 +127,12 @@ class LimitsSection(Section):
     lag_s: Annotated[float, Field(gt=0, le=60)] = 0.5
 
 
+class RecordingSection(Section):
+    """``[recording]``: how far its data are brought at every flush."""
+
+    survives_power_cut: bool = False
+
+
 class Bench(Section):
     """A whole bench file. Pump and pressure are needed by scenes with pressure only."""
 
@@ -137,6 +143,7 @@ class Bench(Section):
     limits: LimitsSection
     pump: PumpSection | None = None
     pressure: PressureSection | None = None
+    recording: RecordingSection = RecordingSection()
 
     @model_validator(mode="after")
     def _cell_is_protected(self) -> Bench:

@@ -13,7 +13,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import PumpState, PumpStatus, StageStatus
 from rig.errors import FileError
+from rig.journal import Journal, sync
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase
 from rig.seal import seal
 from sequences.frame import Frame
@@ -93,6 +94,8 @@ class Recorder:
         Names of the raw channels, in order.
     metadata
         Texts kept whole beside the data: scene, bench, calibrations, versions, seed, ...
+    journalled
+        Whether what is acknowledged survives a power cut too, by a journal beside the recording (``rig.journal``).
 
     Raises
     ------
@@ -101,7 +104,14 @@ class Recorder:
     """
 
     def __init__(
-        self, path: Path, info: RunInfo, channels: tuple[str, ...], metadata: Mapping[str, str], units: str = "V"
+        self,
+        path: Path,
+        info: RunInfo,
+        channels: tuple[str, ...],
+        metadata: Mapping[str, str],
+        units: str = "V",
+        *,
+        journalled: bool = False,
     ) -> None:
         self.path = path
         self.acknowledged = 0
@@ -110,54 +120,26 @@ class Recorder:
         self._frames: list[tuple[Frame, NDArray[np.float64], float]] = []
         self._last_flush = time.perf_counter()
         self._last_pump: PumpStatus | None = None
+        self._journal: Journal | None = None
+        header: dict[str, Any] = {
+            "info": asdict(info),
+            "channels": list(channels),
+            "metadata": dict(metadata),
+            "units": units,
+            "started": datetime.now(UTC).isoformat(),
+        }
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = h5py.File(path, "x", libver="latest")
+            if journalled:
+                self._journal = Journal(path, header)
         except (OSError, ValueError) as error:
             remedy = "choose another name with --out" if path.exists() else "check the folder, its rights and its space"
             raise FileError(f"recording {path}: cannot be created ({error}). Remedy: {remedy}.") from error
         self._held = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-        self._sets = self._layout(info, channels, metadata, units)
+        self._sets = lay_out(self._file, **header)
         self._file.flush()
         self._file.swmr_mode = True
-
-    def _layout(
-        self, info: RunInfo, channels: tuple[str, ...], metadata: Mapping[str, str], units: str
-    ) -> dict[str, h5py.Dataset]:
-        file = self._file
-        file.attrs.update({"default": "entry", "format": FORMAT})
-        entry = _group(file, "entry", "NXentry", default="data")
-        entry.attrs["title"] = info.title
-        entry["title"] = info.title
-        entry["start_time"] = datetime.now(UTC).isoformat()
-        entry["definition"] = FORMAT
-        notes = _group(entry, "configuration", "NXcollection")
-        for name, text in metadata.items():
-            notes[name] = text
-        notes["run"] = json.dumps(asdict(info))
-        raw = _group(entry, "raw", "NXcollection")
-        raw.attrs["sample_rate_Hz"] = info.rate
-        data = _group(entry, "data", "NXdata", signal="force", axes="time")
-        sets = {
-            "volts": _rows(raw, "volts", np.float64, (len(channels),), 4096, units=units),
-            "frames": _rows(raw, "frames", FRAMES, (), 512),
-            "stage": _rows(raw, "stage", STAGE, (), 512),
-            "time": _rows(data, "time", np.float64, (), 4096, units="s"),
-            "force": _rows(data, "force", np.float64, (), 4096, units="N", long_name="F_r (N), untared"),
-            "height": _rows(data, "height", np.float64, (), 4096, units="m"),
-            "steps": _rows(entry, "steps", STEPS, (), 64),
-            "events": _rows(entry, "events", EVENTS, (), 64),
-            "predictions": _rows(entry, "predictions", PREDICTIONS, (), 8),
-            "ending": _rows(entry, "ending", ENDING, (), 1),
-        }
-        sets["volts"].attrs["channels"] = list(channels)
-        auxiliary = ["height"]
-        if info.uses_pressure:
-            sets["pressure"] = _rows(data, "pressure", np.float64, (), 4096, units="Pa", long_name="P_a (Pa), gauge")
-            sets["pump"] = _rows(raw, "pump", PUMP, (), 512)
-            auxiliary.append("pressure")
-        data.attrs["auxiliary_signals"] = auxiliary
-        return sets
 
     def append(self, frame: Frame, height: NDArray[np.float64], arrived: float) -> None:
         """Take one frame; it is acknowledged with the next flush."""
@@ -200,20 +182,25 @@ class Recorder:
         FileError
             The disk is full or gone; what was acknowledged before stays readable.
         """
+        blocks = self._blocks()
         with self._detached_on_failure():
-            for name, blocks in self._pending.items():
-                _extend(self._sets[name], np.concatenate(blocks))
-            if self._frames:
-                self._write_frames([frame for frame, _, _ in self._frames])
+            if self._journal is not None and blocks:
+                self._journal.write(blocks)
+            for name, block in blocks.items():
+                extend(self._sets[name], block)
         if self._frames:
             self.acknowledged = self._frames[-1][0].stop
         self._pending.clear()
         self._frames.clear()
         self._last_flush = time.perf_counter()
 
-    def _write_frames(self, frames: list[Frame]) -> None:
-        """Write the frames pending; their table goes last: it commits the rest."""
-        write = {
+    def _blocks(self) -> dict[str, NDArray[Any]]:
+        """Return the rows pending for each dataset; the frames' table goes last: it commits the rest."""
+        blocks = {name: np.concatenate(rows) for name, rows in self._pending.items()}
+        if not self._frames:
+            return blocks
+        frames = [frame for frame, _, _ in self._frames]
+        blocks |= {
             "volts": np.concatenate([frame.volts for frame in frames], axis=1).T,
             "time": np.arange(frames[0].start, frames[-1].stop) / frames[0].rate,
             "force": np.concatenate([frame.force for frame in frames]),
@@ -223,9 +210,7 @@ class Recorder:
             "pressure": np.concatenate([frame.pressure for frame in frames if frame.pressure is not None] or [_NONE]),
             "frames": np.array([(frame.start, frame.force.size, at) for frame, _, at in self._frames], FRAMES),
         }
-        for name, block in write.items():
-            if len(block):
-                _extend(self._sets[name], block)
+        return {name: block for name, block in blocks.items() if len(block)}
 
     def _pump_polls(self, frames: list[Frame]) -> Iterator[tuple[Any, ...]]:
         """Yield each poll of the pump once, with the frame it came with."""
@@ -244,7 +229,11 @@ class Recorder:
             self._file.flush()
         try:
             self._file.close()
-            seal(self._rescued())
+            place = self._rescued()
+            seal(place)
+            if self._journal is not None:
+                sync(place)
+                self._journal.close(keep=False)
         finally:
             os.close(self._held)
 
@@ -294,6 +283,8 @@ class Recorder:
                 os.dup2(scratch.fileno(), self._file.id.get_vfd_handle())
             self._file.close()
             os.close(self._held)
+            if self._journal is not None:
+                self._journal.close(keep=True)
             cause = re.search(r"error message = '([^']*)'", str(error))
             raise FileError(
                 f"recording {self.path}: writing failed after {self.acknowledged} samples "
@@ -304,6 +295,58 @@ class Recorder:
     def _put(self, name: str, block: NDArray[Any]) -> None:
         if self._file:
             self._pending.setdefault(name, []).append(block)
+
+
+def lay_out(
+    file: h5py.File,
+    info: Mapping[str, Any],
+    channels: Sequence[str],
+    metadata: Mapping[str, str],
+    units: str,
+    started: str,
+) -> dict[str, h5py.Dataset]:
+    """Make every group and dataset of a recording, empty; return the datasets that grow, by name.
+
+    Parameters
+    ----------
+    info
+        A ``RunInfo`` as a dictionary.
+    started
+        When the run began, ISO 8601.
+    """
+    file.attrs.update({"default": "entry", "format": FORMAT})
+    entry = _group(file, "entry", "NXentry", default="data")
+    entry.attrs["title"] = info["title"]
+    entry["title"] = info["title"]
+    entry["start_time"] = started
+    entry["definition"] = FORMAT
+    notes = _group(entry, "configuration", "NXcollection")
+    for name, text in metadata.items():
+        notes[name] = text
+    notes["run"] = json.dumps(info)
+    raw = _group(entry, "raw", "NXcollection")
+    raw.attrs["sample_rate_Hz"] = info["rate"]
+    data = _group(entry, "data", "NXdata", signal="force", axes="time")
+    sets = {
+        "volts": _rows(raw, "volts", np.float64, (len(channels),), 4096, units=units),
+        "frames": _rows(raw, "frames", FRAMES, (), 512),
+        "stage": _rows(raw, "stage", STAGE, (), 512),
+        "time": _rows(data, "time", np.float64, (), 4096, units="s"),
+        "force": _rows(data, "force", np.float64, (), 4096, units="N", long_name="F_r (N), untared"),
+        "height": _rows(data, "height", np.float64, (), 4096, units="m"),
+        "steps": _rows(entry, "steps", STEPS, (), 64),
+        "events": _rows(entry, "events", EVENTS, (), 64),
+        "predictions": _rows(entry, "predictions", PREDICTIONS, (), 8),
+        "ending": _rows(entry, "ending", ENDING, (), 1),
+    }
+    sets["volts"].attrs["channels"] = list(channels)
+    auxiliary = ["height"]
+    if info["uses_pressure"]:
+        sets["pressure"] = _rows(data, "pressure", np.float64, (), 4096, units="Pa", long_name="P_a (Pa), gauge")
+        sets["pump"] = _rows(raw, "pump", PUMP, (), 512)
+        auxiliary.append("pressure")
+    data.attrs["auxiliary_signals"] = auxiliary
+    return sets
 
 
 def _scratch() -> str | None:
@@ -332,7 +375,8 @@ def _rows(
     return dataset
 
 
-def _extend(dataset: h5py.Dataset, block: NDArray[Any]) -> None:
+def extend(dataset: h5py.Dataset, block: NDArray[Any]) -> None:
+    """Append rows to a dataset and hand them to the operating system."""
     size = dataset.shape[0]
     dataset.resize(size + len(block), axis=0)
     dataset[size:] = block

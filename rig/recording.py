@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from analysis.run import Run, Sensors, Step
 from rig.bench import Bench, parse_bench
 from rig.errors import FileError
+from rig.journal import journal_of, read_journal, sync, sync_folder
 from rig.observe import StepPhase
-from rig.recorder import ENDING, EVENTS, FORMAT, FRAMES, PREDICTIONS, PUMP, STAGE, STEPS
+from rig.recorder import ENDING, EVENTS, FORMAT, FRAMES, PREDICTIONS, PUMP, STAGE, STEPS, extend, lay_out
 from rig.scene import Scene, parse_scene
-from rig.seal import is_sealed, probe
+from rig.seal import is_sealed, probe, seal
 
 _PER_SAMPLE = ("raw/volts", "data/time", "data/force", "data/height", "data/pressure")
 _TABLES = {
@@ -56,54 +57,104 @@ def open_recording(path: Path) -> Iterator[h5py.Group]:
     FileError
         The file is missing, damaged beyond repair, or no recording of this rig.
     """
-    if not path.is_file():
-        raise FileError(f"recording {path}: no such file. Remedy: check the path.")
+    _insist(path)
     if not is_sealed(path):
-        probe(path)
-        if _is_marked_open(path) and not _writer_lives(path):
-            recover(path)
-    with _opened(path, swmr=_is_marked_open(path)) as file:
+        _mend(path)
+    with _opened(path) as file:
         yield _entry(file, path)
+
+
+def _mend(path: Path) -> None:
+    """Repair what a crash has left; a recording that is still being written stays as it is."""
+    if _rewritten(path, force=False) is not None:
+        return
+    probe(path)
+    with _opened(path) as file:
+        dead = file.swmr_mode and not _writer_lives(file)
+    if dead:
+        _repair(path)
 
 
 def read_through(path: Path) -> None:
     """Read everything a recording holds, in a process that may be killed for it; see ``rig.seal``."""
-    with _opened(path, swmr=_is_marked_open(path)) as file:
+    with _opened(path) as file:
         _load(_entry(file, path), path)
 
 
 def recover(path: Path, *, force: bool = False) -> Recovery:
     """Repair a recording left by a crash, so that a plain ``h5py.File(path)`` opens it.
 
-    The readable content is copied into a new file, which then takes the old one's place; streams that one flush had
-    reached and another not are cut to the last complete frame.
+    Where a journal lies beside it the recording is written anew from that. Else the readable content is copied into a
+    new file, which then takes the old one's place; streams that one flush had reached and another not are cut to the
+    last complete frame.
 
     Raises
     ------
     FileError
         The file cannot be read at all, or the program that writes it is still running (``force`` overrides).
     """
+    _insist(path)
+    rewritten = None if is_sealed(path) else _rewritten(path, force=force)
+    if rewritten is not None:
+        return rewritten
+    with _opened(path) as file:
+        if file.swmr_mode and not force and _writer_lives(file):
+            raise FileError(f"recording {path}: is still being written. Remedy: wait for the run to end.")
+        if not file.swmr_mode:
+            return Recovery(path, *_complete(_entry(file, path)), repaired=False)
+    return _repair(path)
+
+
+def _insist(path: Path) -> None:
     if not path.is_file():
         raise FileError(f"recording {path}: no such file. Remedy: check the path.")
-    marked = _is_marked_open(path)
-    if marked and not force and _writer_lives(path):
-        raise FileError(f"recording {path}: is still being written. Remedy: wait for the run to end.")
-    fresh = path.with_name(f".{path.name}.recovering")
-    with _opened(path, swmr=marked) as file:
-        entry = _entry(file, path)
-        samples, frames = _complete(entry)
-        if not marked:
-            return Recovery(path, samples, frames, repaired=False)
-        try:
-            _copy(file, fresh, samples, frames)
-        except (OSError, RuntimeError, KeyError) as error:
-            fresh.unlink(missing_ok=True)
-            raise FileError(
-                f"recording {path}: cannot be repaired ({error}). It is left as it was. Remedy: free space beside it "
-                "and try again; keep a copy of the file."
-            ) from error
-    os.replace(fresh, path)
+
+
+def _repair(path: Path) -> Recovery:
+    """Copy what is whole in a file with the mark of a writer into a new one."""
+    with _replacing(path) as fresh, _opened(path) as file:
+        samples, frames = _complete(_entry(file, path))
+        _copy(file, fresh, samples, frames)
     return Recovery(path, samples, frames, repaired=True)
+
+
+def _rewritten(path: Path, *, force: bool) -> Recovery | None:
+    """Write a recording anew from its journal; ``None`` if it has none, or its writer lives."""
+    journal = journal_of(path)
+    try:
+        header, records = read_journal(journal)
+    except FileError:
+        return None
+    if not force and _author_lives(header["info"], header["metadata"]):
+        return None
+    with _replacing(path) as fresh, h5py.File(fresh, "w", libver="latest") as file:
+        sets = lay_out(file, **header)
+        for blocks in records:
+            for name, block in blocks.items():
+                extend(sets[name], block)
+        samples, frames = _complete(file["entry"])
+        _end(file["entry"], samples)
+    journal.unlink()
+    return Recovery(path, samples, frames, repaired=True)
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Give the name of a new file; once written it is sealed, forced to the disk, and takes the old one's place."""
+    fresh = path.with_name(f".{path.name}.recovering")
+    fresh.unlink(missing_ok=True)
+    try:
+        yield fresh
+        seal(fresh)
+        sync(fresh)
+        os.replace(fresh, path)
+        sync_folder(path)
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
+        fresh.unlink(missing_ok=True)
+        raise FileError(
+            f"recording {path}: cannot be repaired ({error}). It is left as it was. Remedy: free space beside it "
+            "and try again; keep a copy of the file."
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -325,15 +376,22 @@ def _filled(table: NDArray[Any]) -> NDArray[Any]:
 
 
 @contextmanager
-def _opened(path: Path, *, swmr: bool) -> Iterator[h5py.File]:
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """Open a file for reading; one with the mark of a writer opens in SWMR mode only."""
     try:
-        file = h5py.File(path, "r", libver="latest", swmr=swmr)
+        file = _marked_or_not(path)
     except (OSError, RuntimeError) as error:
         raise FileError(
             f"recording {path}: not a readable HDF5 file ({error}). Remedy: check that it is the recording and whole."
         ) from error
     with file:
         yield file
+
+
+def _marked_or_not(path: Path) -> h5py.File:
+    with suppress(OSError, RuntimeError):
+        return h5py.File(path, "r", libver="latest")
+    return h5py.File(path, "r", libver="latest", swmr=True)
 
 
 def _entry(file: h5py.File, path: Path) -> h5py.Group:
@@ -360,42 +418,37 @@ def _check_inside(group: h5py.Group, path: Path) -> None:
             )
 
 
-def _is_marked_open(path: Path) -> bool:
-    """Whether HDF5 finds the mark of a writer in the file."""
+def _writer_lives(file: h5py.File) -> bool:
+    """Whether the process that began the recording is still there."""
     try:
-        with h5py.File(path, "r"):
-            return False
-    except (OSError, RuntimeError):
-        return True
+        info = json.loads(file["entry/configuration/run"].asstr()[()])
+        started = file["entry/configuration/process_started"].asstr()[()]
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeDecodeError):
+        return False
+    return _author_lives(info, {"process_started": started})
 
 
-def _writer_lives(path: Path) -> bool:
-    """Whether the process that began the recording is still there (and is not another one with its number)."""
+def _author_lives(info: Any, metadata: Any) -> bool:
+    """Whether the process that began a recording is still there, and no other one has its number."""
     import psutil
 
     try:
-        with _opened(path, swmr=True) as file:
-            info = json.loads(file["entry/configuration/run"].asstr()[()])
-            started = file["entry/configuration/process_started"].asstr()[()]
-    except (FileError, OSError, RuntimeError, KeyError, ValueError, UnicodeDecodeError):
-        return False
-    try:
-        return abs(psutil.Process(int(info["pid"])).create_time() - float(started)) < 2.0
-    except (psutil.Error, ValueError, KeyError):
+        return abs(psutil.Process(int(info["pid"])).create_time() - float(metadata["process_started"])) < 2.0
+    except (psutil.Error, LookupError, TypeError, ValueError, OverflowError):
         return False
 
 
 def _copy(file: h5py.File, fresh: Path, samples: int, frames: int) -> None:
-    fresh.unlink(missing_ok=True)
     with h5py.File(fresh, "w", libver="latest") as copy:
         copy.attrs.update(file.attrs)
         _copy_group(file, copy, samples, frames)
-        entry = copy["entry"]
-        if not len(entry["ending"]):
-            entry["ending"].resize(1, axis=0)
-            entry["ending"][0] = np.array((b"the program died; recovered", -9, samples, b""), ENDING)
-    with fresh.open("rb+") as written:
-        os.fsync(written.fileno())
+        _end(copy["entry"], samples)
+
+
+def _end(entry: h5py.Group, samples: int) -> None:
+    """Say that the program died, unless the recording says how it ended."""
+    if not len(entry["ending"]):
+        extend(entry["ending"], np.array([(b"the program died; recovered", -9, samples, b"")], ENDING))
 
 
 def _copy_group(source: h5py.Group, target: h5py.Group, samples: int, frames: int) -> None:

@@ -127,7 +127,8 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     apparatus = Apparatus(stage, pump, reporter, request.bench.limits.look_ahead_um * 1e-6)
     steps = build_steps(request.scene, apparatus)
     info = _info(request, opened, steps)
-    recorder = Recorder(request.out, info, opened.daq.channels, _metadata(request))
+    journalled = request.bench.recording.survives_power_cut
+    recorder = Recorder(request.out, info, opened.daq.channels, _metadata(request), journalled=journalled)
     reporter.store = recorder
     if request.live:
         add_live_prediction(reporter, request.scene, request.bench, virtual=opened.virtual)

@@ -384,8 +384,8 @@ def _watched(stage: Stage, trouble: Trouble, forces: list[float]) -> Iterator[No
         bench.plant.advance = advanced  # type: ignore[method-assign]
         return bench
 
-    def recorder(*arguments: Any) -> Recorder:
-        stage.recorder = record(*arguments)
+    def recorder(*arguments: Any, **options: Any) -> Recorder:
+        stage.recorder = record(*arguments, **options)
         return stage.recorder
 
     def opened(request: Request) -> Any:
