@@ -26,6 +26,7 @@ def emulated_bench(request: Request) -> EmulatedBench:
         seed=request.seed,
         speed=request.speed,
         faults=request.faults,
+        referenced=request.referenced,
         wire=request.wire,
         pressure=request.scene.uses_pressure,
         device=_device(request.bench),

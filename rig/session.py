@@ -55,9 +55,9 @@ class Request:
         The files as they were read; they are kept in the recording.
     place
         Position on the membrane, or sample, where a protocol names several.
-    seed, speed, wire, faults
+    seed, speed, wire, faults, referenced
         For the emulated bench only: ``speed`` in times real time, ``None`` as fast as possible; ``wire`` false puts
-        the instruments straight on the plant.
+        the instruments straight on the plant; ``referenced`` is a stage that has not been off since its reference move.
     """
 
     scene: Scene
@@ -70,6 +70,7 @@ class Request:
     wire: bool = True
     live: bool = True
     faults: Faults | None = None
+    referenced: bool = False
     observers: Iterable[Observer] = ()
     controls: Controls = field(default_factory=Controls)
     repeat: int = 1

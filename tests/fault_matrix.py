@@ -40,7 +40,6 @@ TO_PRESSURIZE = STEPS[:5]
 REPEATED = ("preload", "pressurize", "retract")
 MOVING = ("approach", "preload", "retract", "pull-off", "return")
 PROTOCOL = {**SHORT, "tare_s": 0.3, "preload_dwell_s": 0.5, "retract_speed_um_s": 200.0}
-START_MM = 22.5
 LIMIT = load_bench(None)[0].limits.compression_N
 PATIENCE_MS = 1000.0
 """Longer than the benches' time-outs: the computer of a test may be busy."""
@@ -314,7 +313,7 @@ def request_of(out: Path, trouble: Trouble, step: str) -> Request:
     bench, bench_text = load_bench(None)
     assert bench.pump is not None
     parts = {
-        "stage": bench.stage.model_copy(update={"start_mm": START_MM, "reply_timeout_ms": PATIENCE_MS}),
+        "stage": bench.stage.model_copy(update={"reply_timeout_ms": PATIENCE_MS}),
         "pump": bench.pump.model_copy(update={"reply_timeout_ms": PATIENCE_MS}),
     }
     bench = bench.model_copy(update=parts)
@@ -330,6 +329,7 @@ def request_of(out: Path, trouble: Trouble, step: str) -> Request:
         wire=bool(trouble.wire),
         live=False,
         faults=Faults(script),
+        referenced=True,
         controls=Controls(),
     )
 
