@@ -1,6 +1,7 @@
 """Record an emulated run and say on standard output what is acknowledged: run as a script, to be killed.
 
-Each line: samples acknowledged, and how long the oldest of those samples had waited, s of wall time.
+Each line: samples acknowledged, how long the oldest of those samples had waited, s of wall time, and the moment, s of
+the monotonic clock. A third word ``journalled`` makes the recording survive a power cut.
 """
 
 from __future__ import annotations
@@ -35,11 +36,13 @@ def main() -> None:
         flush(self)
         age = time.perf_counter() - waiting[0] if waiting else 0.0
         waiting.clear()
-        os.write(out_of_sight, f"{self.acknowledged} {age:.6f}\n".encode())
+        os.write(out_of_sight, f"{self.acknowledged} {age:.6f} {time.monotonic():.6f}\n".encode())
 
     Recorder.append, Recorder.flush = appended, flushed  # type: ignore[method-assign]
     text = scene_text("sphere-60mm-low", **SHORT)
     bench, bench_text = load_bench(None)
+    recording = bench.recording.model_copy(update={"survives_power_cut": "journalled" in sys.argv[3:]})
+    bench = bench.model_copy(update={"recording": recording})
     scene = Scene.model_validate(tomllib.loads(text))
     pace = None if speed == "max" else float(speed)
     run_scene(Request(scene, text, bench, bench_text, out, seed=7, speed=pace, wire=False, live=False))

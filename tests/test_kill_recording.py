@@ -27,16 +27,17 @@ def whole(tmp_path_factory):
     return load_recording(path)
 
 
-def killed(path: Path, seconds: float, speed: str = "max") -> tuple[int, float]:
+def killed(path: Path, seconds: float, speed: str = "max", *options: str) -> tuple[int, float]:
     """Kill a writer so long after its first word; return the samples acknowledged and the longest any had waited, s."""
-    with subprocess.Popen([sys.executable, str(WRITER), str(path), speed], stdout=subprocess.PIPE, text=True) as writer:
+    command = [sys.executable, str(WRITER), str(path), speed, *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
         assert writer.stdout is not None
         told = [writer.stdout.readline()]
         time.sleep(seconds)
         writer.kill()
         told += writer.stdout.readlines()
     rows = [line.split() for line in told if line.endswith("\n")]
-    return int(rows[-1][0]), max(float(age) for _, age in rows)
+    return int(rows[-1][0]), max(float(age) for _, age, _ in rows)
 
 
 def check(path: Path, acknowledged: int, whole) -> None:
@@ -55,10 +56,10 @@ def check(path: Path, acknowledged: int, whole) -> None:
     assert steps == [row["name"] for row in whole.steps][: len(steps)]
 
 
-@pytest.mark.parametrize("trial", range(3))
-def test_a_killed_run_keeps_what_it_acknowledged(trial, tmp_path, whole):
+@pytest.mark.parametrize("options", [("plain",), ("journalled",)])
+def test_a_killed_run_keeps_what_it_acknowledged(options, tmp_path, whole):
     path = tmp_path / "killed.h5"
-    acknowledged, _ = killed(path, random.Random(trial).uniform(0, 0.6))
+    acknowledged, _ = killed(path, random.Random(1).uniform(0, 0.6), "max", *options)
     check(path, acknowledged, whole)
 
 
