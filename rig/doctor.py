@@ -17,6 +17,7 @@ from drivers.errors import DeviceError
 from drivers.interfaces import Daq
 from rig.bench import EMULATED, Bench
 from rig.instruments import Opened, channel_names, open_daq, open_pump, open_stage, sensor_converter
+from rig.one_rig import Claim, InUse
 
 Array = NDArray[np.float64]
 
@@ -35,13 +36,25 @@ class Finding:
 
 
 def examine(bench: Bench) -> Iterator[Finding]:
-    """Yield what is found on a real bench, one instrument after the other; none keeps another from being looked at."""
+    """Yield what is found on a real bench, one instrument after the other; none keeps another from being looked at.
+
+    A rig that another program is using is left alone.
+    """
     yield from _software()
     yield from _ports(bench)
-    yield from _guarded("stage", lambda: _stage(bench))
-    if bench.pump is not None:
-        yield from _guarded("pump", lambda: _pump(bench))
-    yield from _guarded("daq", lambda: _daq(bench))
+    try:
+        claim = Claim(bench, pressure=bench.pump is not None)
+    except InUse as error:
+        seen, _, remedy = str(error).partition(" Remedy: ")
+        yield Finding("rig", False, seen, remedy)
+        return
+    try:
+        yield from _guarded("stage", lambda: _stage(bench))
+        if bench.pump is not None:
+            yield from _guarded("pump", lambda: _pump(bench))
+        yield from _guarded("daq", lambda: _daq(bench))
+    finally:
+        claim.release()
 
 
 def examine_emulated(opened: Opened, bench: Bench) -> Iterator[Finding]:

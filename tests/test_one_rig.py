@@ -16,6 +16,7 @@ from drivers.emulated.bench import EmulatedBench
 from drivers.emulated.truth import Truth
 from drivers.errors import DeviceError, NotConnected
 from rig.bench import load_bench, parse_bench
+from rig.doctor import Finding, examine
 from rig.errors import FileError
 from rig.instruments import open_pump, open_stage
 from rig.one_rig import Claim, InUse, same
@@ -67,6 +68,21 @@ def test_a_run_that_finds_the_rig_taken_opens_nothing(wired, request_for):
     with pytest.raises(DeviceError):  # nobody is there; but the lock is free again
         run_scene(request)
     Claim(bench, pressure=True).release()
+
+
+def test_the_doctor_leaves_a_rig_alone_that_is_in_use(wired, monkeypatch):
+    bench = load_bench(wired)[0]
+    for device in ("stage", "pump", "daq"):
+        monkeypatch.setattr(f"rig.doctor._{device}", lambda bench, name=device: iter([Finding(name, True, "opened")]))
+    claim = Claim(bench, pressure=False)
+    found = list(examine(bench))
+    assert not any(finding.seen == "opened" for finding in found)
+    assert (found[-1].what, found[-1].well) == ("rig", False)
+    assert f"process {os.getpid()}" in found[-1].seen
+    assert "end it first" in found[-1].remedy
+    claim.release()
+    assert [finding.what for finding in examine(bench) if finding.seen == "opened"] == ["stage", "pump", "daq"]
+    Claim(bench, pressure=True).release()  # the doctor has let go of it
 
 
 def test_two_names_of_one_connection_are_one(tmp_path):
