@@ -1,5 +1,10 @@
 """Errors of the instruments: each names the device, what was seen, and what to do."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class DeviceError(Exception):
     """Any failure of an instrument.
@@ -29,6 +34,19 @@ class DeviceError(Exception):
 
 class NotConnected(DeviceError):
     """The port cannot be opened or the far end has closed it."""
+
+
+@contextmanager
+def opening(device: str, connection: str) -> Iterator[None]:
+    """Turn what the opening of a port raises into ``NotConnected``."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise NotConnected(
+            device,
+            f"cannot open {connection}: {error}",
+            "check cable, power and name of the port, and that no other program holds it",
+        ) from error
 
 
 class WrongDevice(DeviceError):

@@ -28,6 +28,7 @@ from drivers.errors import (
     NotConnected,
     OutOfRange,
     WrongDevice,
+    opening,
 )
 from drivers.interfaces import Clock, Identity, PumpState, PumpStatus
 
@@ -278,14 +279,8 @@ class LegatoPump:
     # ------------------------------------------------------------------ connection
 
     def _open(self, baud: int) -> Any:
-        try:
+        with opening(DEVICE, self._connection):
             return open_port(self._connection, baud, self._timeout)
-        except (OSError, ValueError) as error:
-            raise NotConnected(
-                DEVICE,
-                f"cannot open {self._connection}: {error}",
-                "check cable, power and name of the port, and that no other program holds it",
-            ) from error
 
     def _identify(self, expected_model: str) -> Identity:
         remedy = "check the port in the bench file; the pump must speak its current command set at this baud rate"

@@ -21,6 +21,7 @@ from drivers.errors import (
     NotConnected,
     OutOfRange,
     WrongDevice,
+    opening,
 )
 from drivers.gateway import Gateway
 from drivers.interfaces import Clock, Identity, StageStatus
@@ -126,14 +127,8 @@ class PIStage:
         self._limits_idle = 0
         self._limits_seen = 0
         self._limits_accepted = 0
-        try:
+        with opening(DEVICE, connection):
             self._gateway = Gateway(connection, baud, reply_timeout)
-        except (OSError, ValueError) as error:
-            raise NotConnected(
-                DEVICE,
-                f"cannot open {connection}: {error}",
-                "check cable, power and name of the port, and that no other program holds it",
-            ) from error
         self._messages: Any = GCSMessages(self._gateway)
         self._gcs: Any = GCS2Commands(self._messages)
         try:

@@ -16,7 +16,7 @@ from drivers.emulated.faults import Fault, Faults
 from drivers.emulated.line import ContactLine
 from drivers.emulated.membrane import AdhesiveMembrane
 from drivers.emulated.plant import Plant
-from drivers.emulated.specimens import ClosedChamber, DeadWeight, RigidStop, State
+from drivers.emulated.specimens import ClosedChamber, DeadWeight, RigidStop, State, Surroundings
 from drivers.emulated.truth import Truth
 from drivers.emulated.world import World
 
@@ -262,8 +262,10 @@ def test_force_and_release_rate_derive_from_one_potential(diameter, height):
     def at(radius: float, height: float) -> tuple[float, float]:
         state = State(pressure=-2000.0, height=height, radius=radius, stretch=0.01)
         for _ in range(6):
-            state = specimen.step(state, 1e-12, height, -2e-7, 1.0, chamber, 1e12)._replace(radius=radius, speed=0.0)
-        speed = specimen.step(state, 1e-12, height, -2e-7, 1.0, chamber, 1e12).speed
+            state = specimen.step(state, 1e-12, Surroundings(height, -2e-7, 1.0, chamber, 1e12))._replace(
+                radius=radius, speed=0.0
+            )
+        speed = specimen.step(state, 1e-12, Surroundings(height, -2e-7, 1.0, chamber, 1e12)).speed
         return state.force, 1e-3 - 1e3 * speed
 
     radius, step = 5e-3, 2e-6

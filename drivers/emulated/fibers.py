@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drivers.emulated.chamber import Chamber
-from drivers.emulated.specimens import State, finish
+from drivers.emulated.specimens import State, Surroundings, finish
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,25 +26,16 @@ class FewFibers:
     strengths: tuple[float, ...] = (0.60e-3, 0.63e-3, 0.64e-3)
     heights: tuple[float, ...] = (0.0, 0.15e-6, 0.3e-6)
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Balance the holding fibres with the load train; ``state.stretch`` is the set of those that hold, as bits."""
         holding = int(state.stretch)
+        height, stiffness = around.height, around.stiffness
         force, loaded = self._balance(holding, height, stiffness)
         while (changed := self._change(holding, loaded)) != holding:
             holding = changed
             force, loaded = self._balance(holding, height, stiffness)
-        pressure = chamber.pressure(amount, -delivered)
         radius = 37e-6 * math.sqrt(holding.bit_count())
-        return finish(state, duration, force, pressure, loaded, radius, 0.0, float(holding))
+        return finish(state, duration, force, around.closed_pressure, loaded, radius, 0.0, float(holding))
 
     def _balance(self, holding: int, height: float, stiffness: float) -> tuple[float, float]:
         heights = [tip for fiber, tip in enumerate(self.heights) if holding >> fiber & 1]
@@ -92,25 +82,17 @@ class RigidPunch:
 
     _SCAN = 1000
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Balance bed and load train; ``state.stretch`` is where the contact ends, over the disk's radius, plus 1."""
         edge = state.stretch - 1.0
+        height, stiffness = around.height, around.stiffness
         start = min(state.height, height) if edge <= -1.0 else state.height
         loaded = self._balance(edge, start, height, stiffness)
         edge = self._edge(edge, loaded)
-        pressure = chamber.pressure(amount, -delivered)
         area, _ = self._segment(edge)
         radius = math.sqrt(area / math.pi)
-        return finish(state, duration, (loaded - height) * stiffness, pressure, loaded, radius, 0.0, edge + 1.0)
+        force = (loaded - height) * stiffness
+        return finish(state, duration, force, around.closed_pressure, loaded, radius, 0.0, edge + 1.0)
 
     def _edge(self, edge: float, height: float) -> float:
         """Where the contact ends across the disk (-1 nowhere, 1 everywhere) after standing at ``height``."""

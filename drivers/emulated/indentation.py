@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from drivers.emulated.chamber import Chamber
 from drivers.emulated.line import ContactLine, line_error
-from drivers.emulated.specimens import State, finish
+from drivers.emulated.specimens import State, Surroundings, finish
 
 SEED_RADIUS = 20e-6
 """A contact begins and ends at this radius, m."""
@@ -33,18 +32,9 @@ class Indentation:
         default_factory=lambda: ContactLine(receding=3.9, advancing=0.3, line_speed=1.0, rate_exponent=0.35)
     )
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Move the contact line, then balance contact and load train (linear at a fixed radius)."""
-        pressure = chamber.pressure(amount, -delivered)
+        pressure, height, stiffness = around.closed_pressure, around.height, around.stiffness
         radius = state.radius + state.speed * duration
         if radius < SEED_RADIUS:
             if height > 0.0 or state.radius > 0.0:

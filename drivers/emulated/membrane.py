@@ -14,9 +14,9 @@ import contextlib
 import math
 from dataclasses import dataclass, field
 
-from drivers.emulated.chamber import ATMOSPHERE, Chamber
+from drivers.emulated.chamber import ATMOSPHERE
 from drivers.emulated.line import ContactLine, line_error
-from drivers.emulated.specimens import State, finish
+from drivers.emulated.specimens import State, Surroundings, finish
 
 FREE_DEFLECTION = 0.59488
 """Pole of a clamped, inflated membrane over R_0 (p R_0 / E h)^(1/3), Poisson's ratio 1/2 (Hencky)."""
@@ -86,46 +86,25 @@ class AdhesiveMembrane:
         object.__setattr__(self, "smallest_radius", min(FIBER, 0.1 * self.largest_radius))
         object.__setattr__(self, "seat", self._seat())
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Move the contact line, then balance film, gas and load train; without a balance the film is drawn off."""
-        world = (height, delivered, amount, chamber, stiffness)
         radius = min(state.radius + state.speed * duration, self.largest_radius)
         if radius < self.smallest_radius:
-            return self._step_free(state, duration, *world)
+            return self._step_free(state, duration, around)
         try:
-            return self._step_in_contact(state, duration, radius, *world)
+            return self._step_in_contact(state, duration, radius, around)
         except NoEquilibrium:
-            return self._step_free(state, duration, *world)
+            return self._step_free(state, duration, around)
 
-    def _step_in_contact(
-        self,
-        state: State,
-        duration: float,
-        radius: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def _step_in_contact(self, state: State, duration: float, radius: float, around: Surroundings) -> State:
         """Balance at the predicted radius, and again at the corrected one where they differ."""
-        world = (height, delivered, amount, chamber, stiffness)
-        after = self._balance(state, radius, *world)
+        after = self._balance(state, radius, around)
         slip = 0.0
         if after[4] != state.speed:
             better = min(state.radius + 0.5 * (state.speed + after[4]) * duration, self.largest_radius)
             slip = line_error(better - radius, radius - state.radius)
             if slip > 0.1 and better > self.smallest_radius:
-                after = self._balance(state, better, *world)
+                after = self._balance(state, better, around)
         return finish(state, duration, *after, slip)
 
     def _largest_radius(self) -> float:
@@ -155,30 +134,23 @@ class AdhesiveMembrane:
         force = self.rim_stiffness * (math.sqrt(lift * lift - depth * depth) + depth * seated) / math.pi
         return force, self.rim_stiffness * seated / math.pi
 
-    def _step_free(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def _step_free(self, state: State, duration: float, around: Surroundings) -> State:
         """Out of contact the film is a clamped membrane inflated by the gas; it may touch at the end."""
-        inflation = 0.0 if chamber.vented else self._inflate(state, delivered, amount, chamber)
-        pressure = 0.0 if chamber.vented else self._film / self.radius * inflation**3
+        height = around.height
+        inflation = 0.0 if around.chamber.vented else self._inflate(state, around)
+        pressure = 0.0 if around.chamber.vented else self._film / self.radius * inflation**3
         if height < FREE_DEFLECTION * self.radius * inflation:
             begun = State(pressure=pressure, height=height)
             with contextlib.suppress(NoEquilibrium):  # then it does not hold yet
-                touching = self._balance(begun, self.smallest_radius, height, delivered, amount, chamber, stiffness)
+                touching = self._balance(begun, self.smallest_radius, around)
                 if touching[4] >= 0.0:
                     return finish(state, duration, *touching)
-        force, height = self._seated(height, stiffness)
+        force, height = self._seated(height, around.stiffness)
         return finish(state, duration, force, pressure, height, 0.0, 0.0, inflation)
 
-    def _inflate(self, state: State, delivered: float, amount: float, chamber: Chamber) -> float:
+    def _inflate(self, state: State, around: Surroundings) -> float:
         """Cube root of p R_0 / (E h) of the free film with this much gas behind it."""
+        _, delivered, amount, chamber, _ = around
         film = self._film / self.radius
         swept = FREE_VOLUME * self.radius**3
         inflation = state.stretch if state.radius == 0.0 else math.cbrt(state.pressure / film)
@@ -219,20 +191,14 @@ class AdhesiveMembrane:
         return cap, a / below, math.pi * cap / 6 * (3 * a * a + cap * cap), laid
 
     def _balance(
-        self,
-        state: State,
-        radius: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
+        self, state: State, radius: float, around: Surroundings
     ) -> tuple[float, float, float, float, float, float]:
         """Balance film, gas and load train at a given contact radius (Newton in height and pressure).
 
         Returns force, pressure, height, radius, speed of the line, stretch.
         """
         pi = math.pi
+        height, delivered, amount, chamber, stiffness = around
         a, R = radius, self.radius
         film = self._film
         cap, cap_slope, cap_volume, laid = self._laid_on(a)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drivers.emulated.faults import Faults
 from drivers.emulated.motion import Carriage, Plunger
 from drivers.emulated.noise import Drift, NoiseStream
-from drivers.emulated.specimens import Specimen, State
+from drivers.emulated.specimens import Specimen, State, Surroundings
 from drivers.emulated.truth import Truth
 from drivers.emulated.world import Axis, Syringe
 
@@ -178,7 +178,7 @@ class Plant:
         train = self.truth.train
         height = self.axis.position - train.contact_position
         still = State(height=height)
-        state = self._specimen.step(still, LONGEST_STEP, height, 0.0, 1.0, self._chamber, train.stiffness)
+        state = self._specimen.step(still, LONGEST_STEP, Surroundings(height, 0.0, 1.0, self._chamber, train.stiffness))
         return self._knot(0.0, state._replace(trend=0.0, error=0.0), 1.0, 0.0, 0.0)
 
     def _extend(self, until: float) -> None:
@@ -203,7 +203,8 @@ class Plant:
         amount = chamber.leaked(last.amount, last.state.pressure, duration)
         height = self._carriage.position_at(time) - train.contact_position
         delivered = self._plunger.delivered_at(time)
-        state = self._specimen.step(last.state, duration, height, delivered, amount, chamber, train.stiffness)
+        around = Surroundings(height, delivered, amount, chamber, train.stiffness)
+        state = self._specimen.step(last.state, duration, around)
         pushed = state.force if state.force > 0.0 else 0.0
         relaxed = pushed + (last.relaxed - pushed) * math.exp(-duration / train.relaxation_time)
         sensed = chamber.sensed(last.sensed, last.state.pressure, state.pressure, duration)

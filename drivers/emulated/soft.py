@@ -10,8 +10,7 @@ import itertools
 import math
 from dataclasses import dataclass
 
-from drivers.emulated.chamber import Chamber
-from drivers.emulated.specimens import State, finish
+from drivers.emulated.specimens import State, Surroundings, finish
 
 TABLE_S2 = {
     15e-3: ((1.5e3, 0.18), (-51.0e3, 1.18), 0.6e-4),
@@ -57,18 +56,9 @@ class SoftGripper:
         forces = [_line(row[0], row[1], pressure) for row in (below, above)]
         return self.factor * max((1 - share) * forces[0] + share * forces[1], 0.0)
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Balance the empirical law and the load train."""
-        pressure = chamber.pressure(amount, -delivered)
+        pressure, height, stiffness = around.closed_pressure, around.height, around.stiffness
         touching = height < 0.0
         if not touching and (state.radius == 0.0 or state.height > BREAKING * self.distance):
             return finish(state, duration, 0.0, pressure, height, 0.0, 0.0, 0.0)

@@ -46,6 +46,35 @@ class State(NamedTuple):
     error: float = 0.0
 
 
+class Surroundings(NamedTuple):
+    """What the rest of the rig does to a specimen at one instant.
+
+    Attributes
+    ----------
+    height
+        Of the unloaded gripper above the apex, m.
+    delivered
+        Volume out of the syringe, m^3.
+    amount
+        Gas in the chamber over the gas that fills V_0 at room pressure.
+    chamber
+        The gas law.
+    stiffness
+        Of the load train, N/m.
+    """
+
+    height: float
+    delivered: float
+    amount: float
+    chamber: Chamber
+    stiffness: float
+
+    @property
+    def closed_pressure(self) -> float:
+        """Gas pressure over a specimen that does not give way, Pa gauge."""
+        return self.chamber.pressure(self.amount, -self.delivered)
+
+
 FORCE_TOLERANCE = 5e-4
 """How far (N) a step may leave the straight line of the one before."""
 
@@ -53,16 +82,7 @@ FORCE_TOLERANCE = 5e-4
 class Specimen(Protocol):
     """Anything the gripper can be brought onto. Immutable."""
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Return the state ``duration`` seconds later.
 
         Parameters
@@ -71,16 +91,8 @@ class Specimen(Protocol):
             The state before.
         duration
             s.
-        height
-            Height of the unloaded gripper above the apex at the end of the step, m.
-        delivered
-            Volume out of the syringe at the end of the step, m^3.
-        amount
-            Gas in the chamber over the gas that fills V_0 at room pressure.
-        chamber
-            The gas law.
-        stiffness
-            Of the load train, N/m.
+        around
+            What surrounds the specimen at the end of the step.
         """
         ...
 
@@ -106,18 +118,9 @@ def finish(
 class ClosedChamber:
     """The gripper's mouth closed by a rigid plate that touches nothing: for leak and volume tests."""
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Only the gas answers."""
-        return finish(state, duration, 0.0, chamber.pressure(amount, -delivered), height, 0.0, 0.0, 0.0)
+        return finish(state, duration, 0.0, around.closed_pressure, around.height, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,20 +130,11 @@ class DeadWeight:
     mass: float = 0.05
     gravity: float = 9.80665
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """The weight hangs whatever the stage does."""
         force = -self.mass * self.gravity
-        deflected = height + force / stiffness
-        return finish(state, duration, force, chamber.pressure(amount, -delivered), deflected, 0.0, 0.0, 0.0)
+        deflected = around.height + force / around.stiffness
+        return finish(state, duration, force, around.closed_pressure, deflected, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,18 +143,9 @@ class RigidStop:
 
     stop_stiffness: float = 2e6
 
-    def step(
-        self,
-        state: State,
-        duration: float,
-        height: float,
-        delivered: float,
-        amount: float,
-        chamber: Chamber,
-        stiffness: float,
-    ) -> State:
+    def step(self, state: State, duration: float, around: Surroundings) -> State:
         """Two springs in series while they touch."""
-        series = stiffness * self.stop_stiffness / (stiffness + self.stop_stiffness)
-        force = max(0.0, -height * series)
-        pressure = chamber.pressure(amount, -delivered)
-        return finish(state, duration, force, pressure, height + force / stiffness, 0.0, 0.0, 0.0)
+        series = around.stiffness * self.stop_stiffness / (around.stiffness + self.stop_stiffness)
+        force = max(0.0, -around.height * series)
+        loaded = around.height + force / around.stiffness
+        return finish(state, duration, force, around.closed_pressure, loaded, 0.0, 0.0, 0.0)
