@@ -34,11 +34,15 @@ def random_run(number: int, folder, *, wire: bool) -> None:
     protocol = request.scene.protocol.model_copy(
         update={
             "preload_N": draw.uniform(0.05, 0.5),
-            "retract_speed_um_s": draw.uniform(100, 300),
+            "approach_speed_um_s": draw.uniform(50, 100) if wire else draw.uniform(100, 250),
+            "retract_speed_um_s": draw.uniform(150, 450),
             "initial_pressure_kPa": draw.uniform(-4, 4),
         }
     )
     request.scene = request.scene.model_copy(update={"protocol": protocol})
+    if not wire:  # frames cannot come late there, so that the load cell allows a faster approach
+        limits = request.bench.limits.model_copy(update={"lag_s": 0.15})
+        request.bench = request.bench.model_copy(update={"limits": limits})
     request.seed = number
     ending = run_scene(request)
     assert ending.exit_code in EXPLAINED, (number, ending)
