@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -46,6 +47,20 @@ with EmulatedBench(Truth.pull_off(), wire=False) as bench:
     bench.stage(), bench.daq("force")
 """
     assert not {"grpc", "nidaqmx", "pipython"} & imported_by(program)
+
+
+def test_virtual_time_keeps_to_one_core_and_gives_the_others_back():
+    def cores() -> set[int]:
+        return os.sched_getaffinity(0) if sys.platform == "linux" else {0}
+
+    before = cores()
+    with EmulatedBench(Truth.pull_off()) as bench:
+        assert bench.endpoints.daq
+        assert len(cores()) == 1
+    assert cores() == before
+    with EmulatedBench(Truth.pull_off(), speed=1.0) as bench:
+        assert bench.endpoints.daq
+        assert cores() == before
 
 
 def test_wires_and_direct_devices_exclude_each_other():
