@@ -12,7 +12,12 @@ from pydantic import BaseModel, ValidationError
 def explain(what: str, source: str, error: ValidationError, schema: type[BaseModel]) -> str:
     """Return file, key, value, reason and remedy for every finding, one line each."""
     lines = [_line(finding, schema) for finding in error.errors(include_url=False)]
-    return f"{what} {source}: " + "; ".join(dict.fromkeys(lines))
+    return _printable(f"{what} {source}: " + "; ".join(dict.fromkeys(lines)))
+
+
+def _printable(text: str) -> str:
+    """Keep what a file holds from doing anything to the terminal, or from looking like another line."""
+    return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
 def _line(finding: Any, schema: type[BaseModel]) -> str:
