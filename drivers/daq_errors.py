@@ -36,7 +36,8 @@ def translated(connection: str = "") -> Iterator[None]:
         ) from error
     except Error as error:
         raise NotConnected("daq", f"{error}", "install a current NI-DAQmx runtime (ni.com/downloads).") from error
-    except (ValueError, TypeError, LookupError, AssertionError, ArithmeticError) as error:
+    except (ValueError, TypeError, LookupError, AssertionError, ArithmeticError, UnboundLocalError) as error:
+        # UnboundLocalError: nidaqmx 1.7.0 has no answer to a failed call whose error code is 0 or a warning's.
         raise BadReply(
             "daq", f"nidaqmx could not make sense of an answer ({type(error).__name__}: {error})."
         ) from error
