@@ -19,7 +19,7 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 
 from model.errors import InvalidParameter, NotConverged
-from model.membrane_branch import Counter, Line, near_branch, pinned_state, release_branch
+from model.membrane_branch import Counter, Line, pinned_state, release_branch
 from model.membrane_contact import Contact, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
 from model.membrane_equilibrium import solve as solve_states
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 NARROWEST = 1e-7
 """Width of the annulus that stands for r_i = R_0, where the membrane is a strip."""
 ORDERS = (12, 18, 27, 40)
+COARSE_ORDERS = (10, 20, 36)
+"""Orders of the coarse branch: the next where the one before leads nowhere."""
 EXTRA_ORDER = 8
 """The error of the shape is the change of the features when the order rises by this."""
 HALVINGS = 12
@@ -204,30 +206,31 @@ def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Co
 def _solve(
     scaled: Scene, empty: Prediction, points: int, tolerance: float, counter: Counter, memory: Memory
 ) -> Prediction:
-    known, memory.branch = memory.branch, None
-    branch = None
-    if known is not None and known.coordinate[0] == scaled.width:
-        branch = near_branch(scaled.annulus, known, counter)
-    if branch is None:
-        branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter)
-    if branch is None or branch.coordinate.size == 1 or not _rises_above_start(scaled, branch):
-        return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
-    memory.branch = branch
-    found = _refined(scaled, branch, tolerance, counter, memory)
+    for order in COARSE_ORDERS:
+        try:
+            branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, order)
+            if not _rises_above_start(scaled, branch):
+                return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
+            found = _refined(scaled, branch, tolerance, counter, memory, order)
+            break
+        except NotConverged:
+            if order == COARSE_ORDERS[-1]:
+                raise
     if found.features.peak.pull <= 0:
         return replace(empty, outcome=Outcome.NO_ADHESION)
     return _prediction(scaled, found, empty, points)
 
 
-def _rises_above_start(scaled: Scene, branch: Line) -> bool:
-    heights = shape(scaled.annulus, branch.coordinate, branch.state).height
-    return bool((heights > scaled.start).any())
+def _rises_above_start(scaled: Scene, branch: list[Line]) -> bool:
+    return any((shape(scaled.annulus, line.coordinate, line.state).height > scaled.start).any() for line in branch)
 
 
-def _refined(scaled: Scene, branch: Line, tolerance: float, counter: Counter, memory: Memory) -> Found:
+def _refined(
+    scaled: Scene, branch: list[Line], tolerance: float, counter: Counter, memory: Memory, coarse: int
+) -> Found:
     """Raise the order of the shape until the features stand still."""
     relative = math.inf
-    for order in ORDERS:
+    for order in (order for order in ORDERS if order > coarse):
         resolution = _resolution(scaled, order, tolerance)
         peel = peel_panels(scaled.annulus, branch, scaled.start, resolution, counter)
         begins_pinned = peel[0].coordinate[0] == scaled.width

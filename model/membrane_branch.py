@@ -6,6 +6,7 @@ with a secant predictor and a step that adapts; only the pull-off fold is a maxi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,7 +16,18 @@ from numpy.typing import NDArray
 
 from model.errors import NotConverged
 from model.membrane_contact import Surface, frozen
-from model.membrane_equilibrium import Annulus, Closure, Solved, relative_size, release_slope, shape, solve, strip
+from model.membrane_equilibrium import (
+    Annulus,
+    Closure,
+    Gas,
+    Solved,
+    relative_size,
+    release_slope,
+    shape,
+    solve,
+    straight,
+    strip,
+)
 from model.parameters import ContactStretch
 
 Array = NDArray[np.float64]
@@ -24,12 +36,20 @@ COARSE_ORDER = 10
 SMALLEST_CONTACT = 3.9
 """Width ln(R_0 / a) to which a branch is followed at first, a = 0.02 R_0."""
 LAST_WIDTH = 14.0
-STARTS = np.array([0.0, 0.25, 0.7, 1.4, 2.4])
+STARTS = np.array([0.0, 0.25, 0.7, 1.4, 2.4, 4.0, 6.0])
 """Widths, beyond the widest contact's, at which a branch is looked for."""
 NARROW_STRIP = 0.05
 """Width at which the closed form of the strip starts every solution."""
 FOLD_SLOPE = 0.25
 """Rise of the release rate with the rim, relative to that without load, below which it counts as vanishing."""
+PRESTRETCH = 0.1
+"""Prestretch from which the states with a held contact line are reached."""
+SLACK = 1e-8
+"""Part of it that may be left where the membrane goes slack without it."""
+FAINTEST = math.log(1e-12)
+"""Logarithm of the pressure, in tensions over R_0, from which a held pressure is raised."""
+LEAST_BORNE = 0.1
+"""Part of the pressure below which two contacts in a row settle that no smaller one bears it all."""
 WIDE_ANNULUS = 1.0
 """Width at which a sliding contact is entered."""
 FOLD_RATE = 5.0
@@ -67,14 +87,17 @@ class Counter:
 SolveAt = Callable[[float, Array], Array | None]
 
 
-def follow(solve_at: SolveAt, start: float, state: Array, stop: float, *, step: float, smallest: float) -> Line:
+def follow(
+    solve_at: SolveAt, start: float, state: Array, stop: float, *, step: float, smallest: float, relative: float = 0.0
+) -> Line:
     """Follow a solution from ``start`` towards ``stop``; the line ends early where no step succeeds.
 
-    ``solve_at`` returns the state at a coordinate from its prediction, or ``None``.
+    Steps shrink to ``smallest``, and to the part ``relative`` of the place. ``solve_at`` returns the state at a place
+    from its prediction, or ``None``.
     """
     direction = 1.0 if stop > start else -1.0
     places, states = [start], [state]
-    while (stop - places[-1]) * direction > 0 and step > smallest:
+    while (stop - places[-1]) * direction > 0 and step > max(smallest, relative * abs(places[-1])):
         place = places[-1] + direction * min(step, abs(stop - places[-1]))
         solved = solve_at(place, _predict(places, states, place))
         if solved is None:
@@ -97,42 +120,135 @@ def _predict(places: list[float], states: list[Array], place: float) -> Array:
 class Start(NamedTuple):
     """The end of raising a scene's load: its state (1, m), or ``None`` with the reason.
 
-    ``turned``: the solution turned back at a part of the load, beyond which there is no equilibrium of this kind.
+    ``turned``: the solution turned back before the full load, beyond which there is no equilibrium of this kind.
+    ``borne`` is the part of the pressure it bore.
     """
 
     state: Array | None
-    turned: bool
+    turned: bool = False
+    borne: float = 1.0
 
 
 def release_state(annulus: Annulus, width: float, counter: Counter, order: int = COARSE_ORDER) -> Start:
-    """Return the state that peels at the given width, reached from a strip by raising curvature and pressure."""
-    return _raise_load(annulus, width, Closure.RELEASE, 0.0, counter, order)
-
-
-def pinned_state(annulus: Annulus, width: float, height: float, counter: Counter) -> Start:
-    """Return the state with the contact line held at the given width and the rim at ``height``."""
-    return _raise_load(annulus, width, Closure.HEIGHT, height, counter, COARSE_ORDER)
-
-
-def _raise_load(annulus: Annulus, width: float, closure: Closure, height: float, counter: Counter, order: int) -> Start:
+    """Return the state that peels at the given width, reached from a strip by raising curvature, then pressure."""
     flat = _at_fraction(annulus, 0.0)
     rest = _flat_state(flat, width, counter, order)
     if rest is None:
-        return Start(None, turned=False)
+        return Start(None)
+    vented = replace(flat, gas=replace(flat.gas, measured=None))
+    curved = _raised(vented, lambda part: replace(vented, surface=_curved(annulus, part)), width, rest, counter)
+    if curved.state is None or _without_load(annulus.gas):
+        return curved
+    if np.isfinite(annulus.gas.volume) and annulus.gas.measured is None:
+        return _filled(annulus, width, curved.state, counter)
+    eased = replace(annulus, gas=_at_fraction(annulus, 0.0).gas)
+    return _raised(
+        eased, lambda part: replace(annulus, gas=_at_fraction(annulus, part).gas), width, curved.state, counter
+    )
+
+
+def _curved(annulus: Annulus, part: float) -> Surface:
+    return Surface(annulus.surface.curvature * part)
+
+
+def _without_load(gas: Gas) -> bool:
+    return gas.held and gas.pressure == 0
+
+
+def _raised(
+    eased: Annulus, scene_at: Callable[[float], Annulus], width: float, state: Array, counter: Counter
+) -> Start:
+    """Follow a peeling state from the ``eased`` scene to the whole load."""
     widths = np.array([width])
-    lifted = float(shape(flat, widths, rest).height[0])
+
+    def solve_at(part: float, guess: Array) -> Array | None:
+        return _accepted(scene_at(part), widths, guess, Closure.RELEASE, 0.0, counter)
+
+    line = follow(solve_at, 0.0, state, 1.0, step=0.5, smallest=1e-15, relative=1e-6)
+    if line.coordinate[-1] == 1.0:
+        return Start(line.state[-1:])
+    first = release_slope(eased, widths, state)[0]
+    last = release_slope(scene_at(float(line.coordinate[-1])), widths, line.state[-1:])[0]
+    turned = _turned(line, widths) or bool(last < FOLD_SLOPE * first)
+    return Start(None, turned, float(line.coordinate[-1]))
+
+
+def _filled(annulus: Annulus, width: float, state: Array, counter: Counter) -> Start:
+    """Return the peeling state whose pressure is that of its chamber's gas, given the one without pressure.
+
+    Where it is not near, the states are followed in a held pressure until the gas law is met.
+    """
+    widths = np.array([width])
+    near = _accepted(annulus, widths, state, Closure.RELEASE, 0.0, counter)
+    if near is not None:
+        return Start(near)
+    needed = _gas_pressure(annulus, widths, state)
+    sign = math.copysign(1.0, needed)
+
+    def held_at(logarithm: float) -> Annulus:
+        return replace(annulus, gas=replace(annulus.gas, pressure=sign * math.exp(logarithm), volume=np.inf))
+
+    def solve_at(place: float, guess: Array) -> Array | None:
+        if places and _met(annulus, widths, places[-1], sign):
+            return None
+        solved = _accepted(held_at(place), widths, guess, Closure.RELEASE, 0.0, counter)
+        if solved is not None:
+            places.append(solved)
+        return solved
+
+    places: list[Array] = []
+    line = follow(
+        solve_at, FAINTEST, state, math.log(annulus.gas.atmosphere + abs(needed)) + 1, step=2.0, smallest=1e-4
+    )
+    if places and _met(annulus, widths, places[-1], sign):
+        before, after = places[-2] if len(places) > 1 else state, places[-1]
+        for guess in (after, before, (before + after) / 2):
+            met = _accepted(annulus, widths, guess, Closure.RELEASE, 0.0, counter, surprise=np.inf)
+            if met is not None:
+                return Start(met)
+        return Start(None)
+    borne = sign * math.exp(line.coordinate[-1]) / _gas_pressure(annulus, widths, line.state[-1:])
+    first, last = (release_slope(held_at(FAINTEST), widths, one)[0] for one in (state, line.state[-1:]))
+    return Start(None, _turned(line, widths) or bool(last < FOLD_SLOPE * first), float(borne))
+
+
+def _gas_pressure(annulus: Annulus, widths: Array, state: Array) -> float:
+    """Return the pressure the chamber's gas has at the volume of a state; unbounded where there is none."""
+    gas = annulus.gas
+    volume = gas.free_volume + float(shape(annulus, widths, state).volume_change[0])
+    return (gas.atmosphere + gas.pressure) * gas.volume / volume - gas.atmosphere if volume > 0 else math.inf
+
+
+def _met(annulus: Annulus, widths: Array, state: Array, sign: float) -> bool:
+    """Whether a state under held pressure bears at least the pressure of its gas."""
+    return sign * (float(state[0, -2]) - _gas_pressure(annulus, widths, state)) >= 0
+
+
+def pinned_state(annulus: Annulus, width: float, height: float, counter: Counter, order: int = COARSE_ORDER) -> Start:
+    """Return the state with the contact line held at the given width and the rim at ``height``.
+
+    It is reached from a prestretched membrane without pressure, which is taut at any height.
+    """
+    widths = np.array([width])
+    taut = _prestretched(annulus, 0.0)
+    guess = straight(taut, width, height, order)
+    solved = counter.note(solve(taut, widths, guess, closure=Closure.HEIGHT, target=height, iterations=40))
+    if not solved.converged[0]:
+        return Start(None)
 
     def solve_at(fraction: float, guess: Array) -> Array | None:
-        target = (1 - fraction) * lifted + fraction * height
-        return _accepted(_at_fraction(annulus, fraction), widths, guess, closure, target, counter)
+        return _accepted(_prestretched(annulus, fraction), widths, guess, Closure.HEIGHT, height, counter)
 
-    line = follow(solve_at, 0.0, rest, 1.0, step=0.5, smallest=1e-11)
-    first, last = (
-        release_slope(_at_fraction(annulus, float(line.coordinate[i])), widths, line.state[[i]])[0] for i in (0, -1)
-    )
-    if line.coordinate[-1] == 1.0 and (last > 0 or closure is Closure.HEIGHT):
-        return Start(line.state[-1:], turned=False)
-    return Start(None, turned=_turned(line, widths) or bool(last < FOLD_SLOPE * first))
+    line = follow(solve_at, 0.0, solved.state, 1.0, step=0.3, smallest=1e-11)
+    if line.coordinate[-1] > 1 - SLACK:
+        return Start(line.state[-1:])
+    return Start(None, _turned(line, widths))
+
+
+def _prestretched(annulus: Annulus, fraction: float) -> Annulus:
+    """Return the scene at a part of its gas load, the rim prestretched by the rest."""
+    eased = replace(annulus, gas=_at_fraction(annulus, fraction).gas)
+    return replace(eased, prestretch=annulus.prestretch + PRESTRETCH * (1 - fraction))
 
 
 def _flat_state(flat: Annulus, width: float, counter: Counter, order: int) -> Array | None:
@@ -213,49 +329,65 @@ def _accepted(
     return solved.state
 
 
-def release_branch(annulus: Annulus, width: float, height: float, counter: Counter) -> Line | None:
-    """Return the peeling branch from the widest contact, ``width`` = ln(R_0 / r_i), to a small one.
+def release_branch(
+    annulus: Annulus, width: float, height: float, counter: Counter, order: int = COARSE_ORDER
+) -> list[Line]:
+    """Return the peeling branch from the widest contact, ``width`` = ln(R_0 / r_i), to beyond its highest point.
 
-    The widest contact need not have a peeling state: stored stretch or suction may peel it at any height. Then smaller
-    contacts are tried and the branch is followed back to where it ends. ``height`` is z_0. ``None``: no contact that
-    could be solved at z_0 holds there.
+    Stored stretch, inflation or suction may peel a wide contact at any height, and at the contact whose stored stretch
+    just peels it the rim rises through slack states: so the branch is looked for at smaller and smaller contacts, each
+    followed both ways, until its highest point is passed. The lines are its parts, by rising width; none: no contact
+    holds. ``height`` is z_0.
 
     Raises
     ------
     NotConverged
         No state was found, and nothing says that there is none.
     """
-    turned = False
+    lines: list[Line] = []
+    borne: list[float] = []
     for start in map(float, width + STARTS):
-        found = release_state(annulus, start, counter)
-        if found.state is not None:
-            return _both_ways(annulus, start, found.state, width, counter)
-        turned = turned or found.turned
-    if turned:
-        return None
-    for start in map(float, width + STARTS):
-        pinned = pinned_state(annulus, start, height, counter)
-        if pinned.state is None:
-            turned = turned or pinned.turned
+        if lines and (lines[-1].coordinate[-1] >= start or _passed(annulus, lines)):
             continue
-        state, peels = _lift_until_release(annulus, start, pinned.state, height, counter)
+        found = release_state(annulus, start, counter, order)
+        if found.state is not None:
+            reached = float(lines[-1].coordinate[-1]) if lines else width
+            lines.append(_both_ways(annulus, start, found.state, reached, counter))
+        elif found.turned:
+            borne.append(found.borne)
+            if len(borne) > 1 and max(borne[-2:]) < LEAST_BORNE:
+                break
+    explained = bool(borne)
+    if not lines and (not explained or np.isfinite(annulus.gas.volume)):
+        state, place, peels = _released_from_rest(annulus, width, height, counter, order)
         if state is not None:
-            return _both_ways(annulus, start, state, width, counter)
-        turned = turned or peels
-    if not turned:
+            lines = [_both_ways(annulus, place, state, width, counter)]
+        explained = explained or peels
+    if not explained and not (lines and _passed(annulus, lines)):
         raise NotConverged("membrane: no peeling state could be solved; the scene is too extreme for the solver")
-    return None
+    return [line for line in lines if line.coordinate.size > 1]
 
 
-def near_branch(annulus: Annulus, known: Line, counter: Counter) -> Line | None:
-    """Return the branch of a scene next to one whose branch is known, all its states at once; ``None`` if too far."""
-    solved = counter.note(solve(annulus, known.coordinate, known.state, iterations=6))
-    if not solved.converged.all():
-        return None
-    line = Line(known.coordinate, solved.state)
-    if _still_rising(annulus, line) or (release_slope(annulus, line.coordinate, line.state) <= 0).any():
-        return None
-    return line
+def _passed(annulus: Annulus, lines: list[Line]) -> bool:
+    """Whether the branch was followed to a small contact and beyond its highest point."""
+    return bool(lines[-1].coordinate[-1] >= SMALLEST_CONTACT) and not _still_rising(annulus, lines)
+
+
+def _released_from_rest(
+    annulus: Annulus, width: float, height: float, counter: Counter, order: int
+) -> tuple[Array | None, float, bool]:
+    """Return a state that peels, found by raising the rim of a held contact, and its width; or whether all peel."""
+    peels = False
+    for start in map(float, width + STARTS):
+        pinned = pinned_state(annulus, start, height, counter, order)
+        if pinned.state is None:
+            peels = peels or pinned.turned
+            continue
+        state, at_once = _lift_until_release(annulus, start, pinned.state, height, counter)
+        if state is not None:
+            return state, start, False
+        peels = peels or at_once
+    return None, width, peels
 
 
 def _lift_until_release(
@@ -279,7 +411,7 @@ def _both_ways(annulus: Annulus, start: float, state: Array, width: float, count
     line = follow(solve_at, start, state, max(SMALLEST_CONTACT, start + 1), step=0.1, smallest=1e-5)
     if start > width:
         line = _join(follow(solve_at, start, state, width, step=0.05, smallest=2e-4), line)
-    while _still_rising(annulus, line) and line.coordinate[-1] < LAST_WIDTH:
+    while _still_rising(annulus, [line]) and line.coordinate[-1] < LAST_WIDTH:
         end = line.coordinate[-1]
         further = follow(solve_at, end, line.state[-1:], end + 2, step=0.2, smallest=2e-3)
         if further.coordinate.size == 1:
@@ -294,9 +426,9 @@ def _join(first: Line, second: Line) -> Line:
     )
 
 
-def _still_rising(annulus: Annulus, line: Line) -> bool:
-    height = shape(annulus, line.coordinate, line.state).height
-    return bool(height[-1] >= height.max())
+def _still_rising(annulus: Annulus, lines: list[Line]) -> bool:
+    heights = [shape(annulus, line.coordinate, line.state).height for line in lines]
+    return bool(heights[-1][-1] >= max(part.max() for part in heights))
 
 
 def pinned_line(

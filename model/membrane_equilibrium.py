@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.membrane_contact import Contact, EdgeState, Surface
-from model.membrane_material import respond
+from model.membrane_material import respond, tension
 
 Array = NDArray[np.float64]
 
@@ -411,6 +411,23 @@ def strip(work: float, order: int) -> Array:
     state = np.zeros((1, 2 * order + 4))
     state[:, order + 1 : 2 * order + 2] = force / stretch
     state[:, -1] = force * np.sqrt(excess / stretch)
+    return state
+
+
+def straight(annulus: Annulus, width: float, height: float, order: int) -> Array:
+    """Return the guess (1, m) of a prestretched annulus straight from the contact line to the rim at ``height``."""
+    a = np.exp(-np.array([width]))
+    spread = 0.0 if annulus.contact.sticks else annulus.prestretch - 1
+    inner = annulus.contact.radius(annulus.surface, a, spread * a)
+    run, rise = annulus.prestretch - inner, height - annulus.surface.height(inner)
+    R = np.exp(-width * (1 - node_positions(order)))
+    r = inner + run * (R - a) / (1 - a)
+    stretch = np.hypot(run, rise) / (1 - a)
+    momentum = R * np.maximum(tension(stretch, r / R), 1e-3 * (annulus.prestretch - 1))
+    state = np.zeros((1, 2 * order + 4))
+    state[0, : order + 1] = r - R
+    state[0, order + 1 : 2 * order + 2] = momentum * run / np.hypot(run, rise)
+    state[0, -1] = (momentum * rise / np.hypot(run, rise)).mean()
     return state
 
 

@@ -103,7 +103,7 @@ class Features(NamedTuple):
 class Memory:
     """The coarse lines of the last scene, from which a neighbouring one is reached at once."""
 
-    branch: Line | None = None
+    branch: list[Line] | None = None
     pinned: Line | None = None
 
 
@@ -115,13 +115,21 @@ class Resolution(NamedTuple):
     deepest: int
 
 
-def peel_panels(annulus: Annulus, branch: Line, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
+def peel_panels(
+    annulus: Annulus, branch: list[Line], floor: float, resolution: Resolution, counter: Counter
+) -> list[Panel]:
     """Return the peeling branch from where it rises above ``floor`` to its highest point."""
-    heights = shape(annulus, branch.coordinate, branch.state).height
-    first = max(int(np.argmax(heights > floor)) - 1, 0)
-    last = min(int(np.argmax(heights)) + 1, heights.size - 1)
-    ends = float(branch.coordinate[first]), float(branch.coordinate[last])
-    return _panels(annulus, branch, ends, None, resolution, counter, resolution.deepest)
+    heights = [shape(annulus, line.coordinate, line.state).height for line in branch]
+    highest = int(np.argmax([part.max() for part in heights]))
+    rising = next(i for i, part in enumerate(heights) if (part > floor).any())
+    panels = []
+    for i in range(rising, highest + 1):
+        coordinate, height = branch[i].coordinate, heights[i]
+        first = max(int(np.argmax(height > floor)) - 1, 0) if i == rising else 0
+        last = min(int(np.argmax(height)) + 1, height.size - 1) if i == highest else height.size - 1
+        ends = float(coordinate[first]), float(coordinate[last])
+        panels += _panels(annulus, branch[i], ends, None, resolution, counter, resolution.deepest)
+    return panels
 
 
 def pinned_panels(
@@ -282,12 +290,12 @@ def features(pieces: list[Piece], floor: float) -> Features:
 
 
 def _unsolved_below(place: Place, pieces: list[Piece], floor: float) -> float:
-    """Return the height between a place at the beginning of a pinned piece and what was solved below it."""
-    if not place.piece.panel.pinned or place.coordinate != place.piece.begin:
+    """Return the height between a place at the beginning of a piece and what was solved below it."""
+    if place.coordinate != place.piece.begin:
         return 0.0
     index = next(i for i, piece in enumerate(pieces) if piece is place.piece)
-    below = floor if index == 0 else pieces[index - 1].end
-    return place.coordinate - below
+    below = floor if index == 0 else Place(pieces[index - 1], pieces[index - 1].end).height
+    return max(place.height - below, 0.0)
 
 
 def _first_zero(pieces: list[Piece]) -> Place | None:

@@ -12,6 +12,7 @@ from model.membrane_equilibrium import Annulus, Closure, Gas, residual_and_jacob
 from model.membrane_loading import loading_contact
 from model.membrane_material import energy as stored_energy
 from model.membrane_sliding import Sliding, disc_tension
+from model.parameters import ContactStretch
 
 VENTED = Gas(0.0, 5.8, math.inf, 14.0)
 FLAT = Surface(0.0)
@@ -83,7 +84,7 @@ def test_strip_limit_is_reached_at_first_order():
 def fold_of(problem, near):
     """Return radius, height and pull (over 2 pi) at the highest point of the branch, by a local series."""
     places = np.linspace(near - 0.2, near + 0.2, 41)
-    guess = release_branch(problem, 0.0917, 0.0, Counter()).guess(places)
+    guess = release_branch(problem, 0.0917, 0.0, Counter())[0].guess(places)
     solved = solve(problem, places, guess)
     assert solved.converged.all()
     height = np.polynomial.Chebyshev.fit(places, shape(problem, places, solved.state).height, 10)
