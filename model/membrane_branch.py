@@ -48,6 +48,8 @@ SLACK = 1e-8
 """Part of it that may be left where the membrane goes slack without it."""
 FAINTEST = math.log(1e-12)
 """Logarithm of the pressure, in tensions over R_0, from which a held pressure is raised."""
+HALVINGS = 40
+"""How often the step of the pressure is halved within which a chamber's gas is met."""
 LEAST_BORNE = 0.1
 """Part of the pressure below which two contacts in a row settle that no smaller one bears it all."""
 WIDE_ANNULUS = 1.0
@@ -88,12 +90,20 @@ SolveAt = Callable[[float, Array], Array | None]
 
 
 def follow(
-    solve_at: SolveAt, start: float, state: Array, stop: float, *, step: float, smallest: float, relative: float = 0.0
+    solve_at: SolveAt,
+    start: float,
+    state: Array,
+    stop: float,
+    *,
+    step: float,
+    smallest: float,
+    relative: float = 0.0,
+    until: Callable[[Array], bool] | None = None,
 ) -> Line:
     """Follow a solution from ``start`` towards ``stop``; the line ends early where no step succeeds.
 
     Steps shrink to ``smallest``, and to the part ``relative`` of the place. ``solve_at`` returns the state at a place
-    from its prediction, or ``None``.
+    from its prediction, or ``None``. The line also ends at the first state for which ``until`` holds.
     """
     direction = 1.0 if stop > start else -1.0
     places, states = [start], [state]
@@ -106,6 +116,8 @@ def follow(
             places.append(place)
             states.append(solved)
             step *= 1.5
+            if until is not None and until(solved):
+                break
     order = slice(None, None, 1 if direction > 0 else -1)
     return Line(np.array(places)[order], np.concatenate(states)[order])
 
@@ -189,27 +201,39 @@ def _filled(annulus: Annulus, width: float, state: Array, counter: Counter) -> S
         return replace(annulus, gas=replace(annulus.gas, pressure=sign * math.exp(logarithm), volume=np.inf))
 
     def solve_at(place: float, guess: Array) -> Array | None:
-        if places and _met(annulus, widths, places[-1], sign):
-            return None
-        solved = _accepted(held_at(place), widths, guess, Closure.RELEASE, 0.0, counter)
-        if solved is not None:
-            places.append(solved)
-        return solved
+        return _accepted(held_at(place), widths, guess, Closure.RELEASE, 0.0, counter)
 
-    places: list[Array] = []
-    line = follow(
-        solve_at, FAINTEST, state, math.log(annulus.gas.atmosphere + abs(needed)) + 1, step=2.0, smallest=1e-4
-    )
-    if places and _met(annulus, widths, places[-1], sign):
-        before, after = places[-2] if len(places) > 1 else state, places[-1]
-        for guess in (after, before, (before + after) / 2):
-            met = _accepted(annulus, widths, guess, Closure.RELEASE, 0.0, counter, surprise=np.inf)
-            if met is not None:
-                return Start(met)
-        return Start(None)
+    def bears(state: Array) -> bool:
+        return sign * (float(state[0, -2]) - _gas_pressure(annulus, widths, state)) >= 0
+
+    most = math.log(annulus.gas.atmosphere + abs(needed)) + 1
+    line = follow(solve_at, FAINTEST, state, most, step=2.0, smallest=1e-4, until=bears)
+    if bears(line.state[-1:]):
+        return Start(_where_gas_is_met(annulus, widths, line, solve_at, bears, counter))
     borne = sign * math.exp(line.coordinate[-1]) / _gas_pressure(annulus, widths, line.state[-1:])
     first, last = (release_slope(held_at(FAINTEST), widths, one)[0] for one in (state, line.state[-1:]))
     return Start(None, _turned(line, widths) or bool(last < FOLD_SLOPE * first), float(borne))
+
+
+def _where_gas_is_met(
+    annulus: Annulus, widths: Array, line: Line, solve_at: SolveAt, bears: Callable[[Array], bool], counter: Counter
+) -> Array | None:
+    """Halve the last step of a rising held pressure until the state with the gas is near."""
+    (low, high), (below, above) = line.coordinate[-2:], (line.state[-2:-1], line.state[-1:])
+    for _ in range(HALVINGS):
+        for guess in (above, below):
+            met = _accepted(annulus, widths, guess, Closure.RELEASE, 0.0, counter)
+            if met is not None:
+                return met
+        middle = (low + high) / 2
+        between = solve_at(middle, (below + above) / 2)
+        if between is None:
+            return None
+        if bears(between):
+            high, above = middle, between
+        else:
+            low, below = middle, between
+    return None
 
 
 def _gas_pressure(annulus: Annulus, widths: Array, state: Array) -> float:
@@ -217,11 +241,6 @@ def _gas_pressure(annulus: Annulus, widths: Array, state: Array) -> float:
     gas = annulus.gas
     volume = gas.free_volume + float(shape(annulus, widths, state).volume_change[0])
     return (gas.atmosphere + gas.pressure) * gas.volume / volume - gas.atmosphere if volume > 0 else math.inf
-
-
-def _met(annulus: Annulus, widths: Array, state: Array, sign: float) -> bool:
-    """Whether a state under held pressure bears at least the pressure of its gas."""
-    return sign * (float(state[0, -2]) - _gas_pressure(annulus, widths, state)) >= 0
 
 
 def pinned_state(annulus: Annulus, width: float, height: float, counter: Counter, order: int = COARSE_ORDER) -> Start:
@@ -324,6 +343,8 @@ def _accepted(
         return None
     if relative_size(solved.state, solved.state - guess, widths)[0] > surprise:
         return None
+    if np.isfinite(annulus.gas.volume) and solved.state[0, -2] <= -annulus.gas.atmosphere:
+        return None  # the gas law has a second root, at a negative volume
     if closure is Closure.RELEASE and not release_slope(annulus, widths, solved.state)[0] > 0:
         return None  # a lower root: z_eq is the largest
     return solved.state

@@ -219,7 +219,7 @@ def _panel(
     closure = Closure.RELEASE if width is None else Closure.HEIGHT
     guess = resample(line.guess(places), order)
     solved = counter.note(solve(annulus, widths, guess, closure=closure, target=places))
-    if not solved.converged.all():
+    if not solved.converged.all() or (solved.state[:, -2] <= -annulus.gas.atmosphere).any():
         return None
     height = places if width is not None else shape(annulus, widths, solved.state).height
     radius = annulus.contact.radius(annulus.surface, np.exp(-widths), solved.state[:, 0])
