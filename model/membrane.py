@@ -23,7 +23,19 @@ from model.membrane_branch import Counter, Line, pinned_state, release_branch
 from model.membrane_contact import Contact, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
 from model.membrane_equilibrium import solve as solve_states
-from model.membrane_path import Features, Memory, Piece, Place, Resolution, features, path, peel_panels, pinned_panels
+from model.membrane_path import (
+    Features,
+    Memory,
+    Panel,
+    Piece,
+    Place,
+    Resolution,
+    features,
+    neighbour,
+    path,
+    peel_panels,
+    pinned_panels,
+)
 from model.parameters import ContactStretch, GasAnchor, Parameters
 from model.prediction import Jump, Outcome, Prediction
 from model.start import check, start_position, start_radius
@@ -68,11 +80,12 @@ class Errors(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The path of one scene with its features and their errors."""
+    """The path of one scene with its features, their errors and the larger relative one of F_p and D_p."""
 
     pieces: list[Piece]
     features: Features
     errors: Errors
+    relative: float
 
 
 def solve(
@@ -206,19 +219,42 @@ def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Co
 def _solve(
     scaled: Scene, empty: Prediction, points: int, tolerance: float, counter: Counter, memory: Memory
 ) -> Prediction:
-    for order in COARSE_ORDERS:
-        try:
-            branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, order)
-            if not _rises_above_start(scaled, branch):
-                return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
-            found = _refined(scaled, branch, tolerance, counter, memory, order)
-            break
-        except NotConverged:
-            if order == COARSE_ORDERS[-1]:
-                raise
+    found = _restarted(scaled, tolerance, counter, memory)
+    if found is None:
+        for order in COARSE_ORDERS:
+            try:
+                branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, order)
+                if not _rises_above_start(scaled, branch):
+                    return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
+                found = _refined(scaled, branch, tolerance, counter, memory, order)
+                break
+            except NotConverged:
+                if order == COARSE_ORDERS[-1]:
+                    raise
+    assert found is not None
     if found.features.peak.pull <= 0:
         return replace(empty, outcome=Outcome.NO_ADHESION)
     return _prediction(scaled, found, empty, points)
+
+
+def _restarted(scaled: Scene, tolerance: float, counter: Counter, memory: Memory) -> Found | None:
+    """Return the path of a scene next to the one remembered; ``None`` if it is too far or less precise."""
+    panels = neighbour(scaled.annulus, memory, scaled.width, scaled.start, counter)
+    if panels is None:
+        return None
+    found = _read(scaled, *panels, counter)
+    reachable = 1.5 * memory.relative if memory.tolerance <= tolerance else 0.0
+    if not found.relative <= max(tolerance, reachable):
+        return None
+    memory.peel, memory.pinned = panels
+    return found
+
+
+def _read(scaled: Scene, peel: list[Panel], pinned: list[Panel], counter: Counter) -> Found:
+    pieces = path(peel, pinned, scaled.start)
+    read = features(pieces, scaled.start)
+    errors = _errors(scaled, read, counter)
+    return Found(pieces, read, errors, _relative(read, errors))
 
 
 def _rises_above_start(scaled: Scene, branch: list[Line]) -> bool:
@@ -229,21 +265,21 @@ def _refined(
     scaled: Scene, branch: list[Line], tolerance: float, counter: Counter, memory: Memory, coarse: int
 ) -> Found:
     """Raise the order of the shape until the features stand still."""
-    relative = math.inf
+    found: Found | None = None
     for order in (order for order in ORDERS if order > coarse):
         resolution = _resolution(scaled, order, tolerance)
         peel = peel_panels(scaled.annulus, branch, scaled.start, resolution, counter)
         begins_pinned = peel[0].coordinate[0] == scaled.width
         pinned = []
         if begins_pinned:
-            pinned = pinned_panels(scaled.annulus, peel[0], scaled.start, resolution, counter, memory)
-        pieces = path(peel, pinned, scaled.start)
-        read = features(pieces, scaled.start)
-        errors = _errors(scaled, read, counter)
-        before, relative = relative, _relative(read, errors)
-        found = Found(pieces, read, errors)
-        if relative <= tolerance or relative > 0.5 * before:
+            pinned = pinned_panels(scaled.annulus, peel[0], scaled.start, resolution, counter)
+        before, found = found, _read(scaled, peel, pinned, counter)
+        memory.width, memory.tolerance, memory.relative = scaled.width, tolerance, found.relative
+        memory.peel, memory.pinned = peel, pinned
+        if found.relative <= tolerance or (before is not None and found.relative > 0.5 * before.relative):
             break
+    assert found is not None
+    read, errors = found.features, found.errors
     lost = max(errors.force / abs(read.peak.pull or 1.0), errors.detachment / max(read.travel, 1e-300))
     if lost > ACCEPTABLE:
         raise NotConverged(f"membrane: F_p or the detachment is uncertain by {lost:.1e} at the highest order")

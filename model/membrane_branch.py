@@ -33,6 +33,8 @@ from model.parameters import ContactStretch
 Array = NDArray[np.float64]
 
 COARSE_ORDER = 10
+COARSE = 1e-4
+"""Newton's last step on a coarse line, which serves as a guess."""
 SMALLEST_CONTACT = 3.9
 """Width ln(R_0 / a) to which a branch is followed at first, a = 0.02 R_0."""
 LAST_WIDTH = 14.0
@@ -338,7 +340,7 @@ def _accepted(
     *,
     surprise: float = LARGEST_SURPRISE,
 ) -> Array | None:
-    solved = counter.note(solve(annulus, widths, guess, closure=closure, target=target, iterations=9))
+    solved = counter.note(solve(annulus, widths, guess, closure=closure, target=target, iterations=9, precision=COARSE))
     if not solved.converged[0]:
         return None
     if relative_size(solved.state, solved.state - guess, widths)[0] > surprise:
@@ -452,21 +454,9 @@ def _still_rising(annulus: Annulus, lines: list[Line]) -> bool:
     return bool(heights[-1][-1] >= max(part.max() for part in heights))
 
 
-def pinned_line(
-    annulus: Annulus, width: float, state: Array, top: float, bottom: float, counter: Counter, known: Line | None = None
-) -> Line:
-    """Return the pinned states from the rim height ``top`` of a known state down (or up) to ``bottom``.
-
-    ``known`` is such a line of a neighbouring scene: then all states are tried at once first.
-    """
+def pinned_line(annulus: Annulus, width: float, state: Array, top: float, bottom: float, counter: Counter) -> Line:
+    """Return the pinned states from the rim height ``top`` of a known state down (or up) to ``bottom``."""
     widths = np.array([width])
-    if known is not None and known.coordinate.size > 1:
-        low, high = known.coordinate[[0, -1]]
-        heights = bottom + (top - bottom) * (known.coordinate - low) / (high - low)
-        tried = np.full(heights.size, width)
-        solved = solve(annulus, tried, known.state, closure=Closure.HEIGHT, target=heights, iterations=6)
-        if counter.note(solved).converged.all():
-            return Line(heights, solved.state)
 
     def solve_at(height: float, guess: Array) -> Array | None:
         return _accepted(annulus, widths, guess, Closure.HEIGHT, height, counter)

@@ -24,7 +24,7 @@ from model.membrane_material import respond, tension
 
 Array = NDArray[np.float64]
 
-STEP_TOLERANCE = 1e-8
+STEP_TOLERANCE = 1e-7
 """Newton's last step; convergence is quadratic, so that the state after it is exact to rounding."""
 LONGEST_STEP = 0.5
 """Largest relative change of the shape in one step; the pressure follows the shape and is not limited."""
@@ -178,6 +178,7 @@ class _Fields:
         order = state.shape[1] // 2 - 2
         self.grid = grid(order)
         self.order = order
+        self.at_line = [0, order + 1, -2, -1]
         u, q = state[:, : order + 1], state[:, order + 1 : 2 * order + 2]
         self.p, self.f = state[:, -2], state[:, -1]
         self.R = np.exp(-self.width[:, None] * (1 - self.grid.points))
@@ -204,12 +205,27 @@ def residual_and_jacobian(
     annulus: Annulus, width: Array, state: Array, closure: Closure, target: Array
 ) -> tuple[Array, Array]:
     """Return residual (n, m) and Jacobian (n, m, m); ``target`` (n,) is the height of the closure."""
+    s, residual, J, partial = _unclosed(annulus, width, state)
+    if closure is Closure.HEIGHT:
+        residual[:, -1] = (s.height - target) / s.width
+        J[:, -1] = _height_row(s, partial) / s.width[:, None]
+    elif closure is Closure.RELEASE:
+        residual[:, -1] = s.edge.release - annulus.work
+        J[:, -1, s.at_line] = s.edge.release_by
+    else:
+        residual[:, -1] = s.edge.tangency
+        J[:, -1, s.at_line] = s.edge.tangency_by
+    return residual, J
+
+
+def _unclosed(annulus: Annulus, width: Array, state: Array) -> tuple[_Fields, Array, Array, _Partial]:
+    """Return fields, residual and Jacobian with the last row, which closes the problem, left at zero."""
     s = _Fields(annulus, width, state)
     n, m = state.shape
     order, B, D = s.order, s.grid.values, s.grid.slopes
     lam, w2, A, K, C = s.response
     c, si, p, r = s.cosine, s.sine, s.p[:, None], s.r
-    residual = np.empty((n, m))
+    residual = np.zeros((n, m))
     residual[:, :order] = s.r_slope - (lam - 1) * c + np.where(c > 0, si**2 / (1 + np.abs(c)), 1 - c)
     residual[:, order : 2 * order] = s.q_slope - w2 + p * r * lam * si
     residual[:, -4] = s.edge.tie
@@ -238,22 +254,12 @@ def residual_and_jacobian(
     by_P = -w_P + pr * Y_P
     J[:, top, -2], J[:, top, -1] = -X_P * half, -X_P
     J[:, low, -2], J[:, low, -1] = by_P * half + r * Y, by_P
-    line = [0, order + 1, -2, -1]
-    J[:, -4, line] = s.edge.tie_by
+    J[:, -4, s.at_line] = s.edge.tie_by
     J[:, -3, order] = 1 / s.width
 
     partial = _Partial(Y, Y_r, X_P, Y_P, half)
     _gas_row(s, residual, J, partial)
-    if closure is Closure.HEIGHT:
-        residual[:, -1] = (s.height - target) / s.width
-        J[:, -1] = _height_row(s, partial) / s.width[:, None]
-    elif closure is Closure.RELEASE:
-        residual[:, -1] = s.edge.release - annulus.work
-        J[:, -1, line] = s.edge.release_by
-    else:
-        residual[:, -1] = s.edge.tangency
-        J[:, -1, line] = s.edge.tangency_by
-    return residual, J
+    return s, residual, J, partial
 
 
 class _Partial(NamedTuple):
@@ -316,8 +322,9 @@ def solve(
     closure: Closure = Closure.RELEASE,
     target: Array | float = 0.0,
     iterations: int = 25,
+    precision: float = STEP_TOLERANCE,
 ) -> Solved:
-    """Solve n states at once by Newton's method from their guesses (n, m)."""
+    """Solve n states at once by Newton's method from their guesses (n, m), to a last step of ``precision``."""
     targets = np.broadcast_to(np.asarray(target, dtype=float), width.shape)
     state = guess.copy()
     converged = np.zeros(width.size, dtype=bool)
@@ -335,7 +342,7 @@ def solve(
         size = relative_size(part, step, width[active])
         fraction = np.minimum(1.0, LONGEST_STEP / np.maximum(_change_of_shape(part, step, width[active]), 1e-300))
         state[active] = part + fraction[:, None] * step
-        done = (size < STEP_TOLERANCE) | ((size < ROUNDING) & (size > 0.1 * before[active]))
+        done = (size < precision) | ((size < ROUNDING) & (size > 0.1 * before[active]))
         before[active] = size
         converged[active[done]] = True
         active = active[~done & np.isfinite(size)]
@@ -364,13 +371,12 @@ def release_slope(annulus: Annulus, width: Array, state: Array) -> Array:
 
     Negative on the lower of two roots: there a higher rim relaxes the stretch stored in contact.
     """
-    height = np.zeros_like(width)
-    _, by_height = residual_and_jacobian(annulus, width, state, Closure.HEIGHT, height)
-    _, by_release = residual_and_jacobian(annulus, width, state, Closure.RELEASE, height)
-    right = np.zeros_like(state)
-    right[:, -1] = 1 / width
-    slope: Array = -(by_release[:, -1] * _newton_step(by_height, right)).sum(axis=1)
-    return slope
+    s, right, jacobian, partial = _unclosed(annulus, width, state)
+    jacobian[:, -1] = _height_row(s, partial)
+    right[:] = 0.0
+    right[:, -1] = 1.0
+    by_height = _newton_step(jacobian, right)
+    return np.asarray(-(s.edge.release_by * by_height[:, s.at_line]).sum(axis=1))
 
 
 def relative_size(state: Array, step: Array, width: Array) -> Array:

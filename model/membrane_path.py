@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,8 +11,17 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 
 from model.errors import NotConverged
-from model.membrane_branch import Counter, Line, pinned_line, pinned_state
-from model.membrane_equilibrium import Annulus, Closure, node_positions, release_slope, resample, shape, solve
+from model.membrane_branch import LARGEST_SURPRISE, Counter, Line, pinned_line, pinned_state
+from model.membrane_equilibrium import (
+    Annulus,
+    Closure,
+    node_positions,
+    relative_size,
+    release_slope,
+    resample,
+    shape,
+    solve,
+)
 
 Array = NDArray[np.float64]
 
@@ -20,6 +29,10 @@ PANEL_SIZES = (16, 32)
 """Points of a panel, less one. A panel that the larger number does not resolve is halved."""
 SHORTEST = 1e-9
 """Rise of a pinned part, relative to the heights it lies between, below which it is left out."""
+
+
+SLACK_TAIL = 1e-5
+"""Last terms of the series to which pinned states are resolved where the gap between them limits D_p anyway."""
 
 
 class Panel(NamedTuple):
@@ -101,10 +114,16 @@ class Features(NamedTuple):
 
 @dataclass(slots=True)
 class Memory:
-    """The coarse lines of the last scene, from which a neighbouring one is reached at once."""
+    """The panels of the last scene, from which a neighbouring one is reached at once.
 
-    branch: list[Line] | None = None
-    pinned: Line | None = None
+    ``tolerance`` was asked for and ``relative`` reached.
+    """
+
+    width: float = np.nan
+    peel: list[Panel] = field(default_factory=list)
+    pinned: list[Panel] = field(default_factory=list)
+    tolerance: float = np.inf
+    relative: float = np.inf
 
 
 class Resolution(NamedTuple):
@@ -132,9 +151,7 @@ def peel_panels(
     return panels
 
 
-def pinned_panels(
-    annulus: Annulus, peel: Panel, floor: float, resolution: Resolution, counter: Counter, memory: Memory
-) -> list[Panel]:
+def pinned_panels(annulus: Annulus, peel: Panel, floor: float, resolution: Resolution, counter: Counter) -> list[Panel]:
     """Return the states at the widest contact from ``floor`` up to where it peels; none if it peels at once.
 
     Where the membrane goes slack on the way, its states are followed from both ends and a gap stays between.
@@ -142,14 +159,14 @@ def pinned_panels(
     width, top = float(peel.coordinate[0]), float(peel.height(peel.coordinate[0]))
     if top - floor <= SHORTEST * (1 + abs(floor)):
         return []
-    upper = pinned_line(annulus, width, peel.state[:1], top, floor, counter, memory.pinned)
+    upper = pinned_line(annulus, width, peel.state[:1], top, floor, counter)
     lines = [upper]
     reached = float(upper.coordinate[0])
-    memory.pinned = upper if reached == floor else None
     if reached > floor:
         bottom = pinned_state(annulus, width, floor, counter).state
         if bottom is not None:
             lines = [pinned_line(annulus, width, bottom, floor, reached, counter), upper]
+            resolution = resolution._replace(tail=max(resolution.tail, SLACK_TAIL))
     return [
         panel
         for line in lines
@@ -221,13 +238,57 @@ def _panel(
     solved = counter.note(solve(annulus, widths, guess, closure=closure, target=places))
     if not solved.converged.all() or (solved.state[:, -2] <= -annulus.gas.atmosphere).any():
         return None
-    height = places if width is not None else shape(annulus, widths, solved.state).height
-    radius = annulus.contact.radius(annulus.surface, np.exp(-widths), solved.state[:, 0])
-    rise, pull, pressure, edge = (
-        _series(values, low, high) for values in (height, solved.state[:, -1], solved.state[:, -2], radius)
-    )
-    tail = max(_tail(rise), _tail(pull))
-    return Panel(places, widths, solved.state, rise, pull, pressure, edge, tail, width is not None)
+    return _as_panel(annulus, places, widths, solved.state, pinned=width is not None)
+
+
+def _as_panel(annulus: Annulus, places: Array, widths: Array, state: Array, *, pinned: bool) -> Panel:
+    low, high = map(float, places[[0, -1]])
+    height = places if pinned else shape(annulus, widths, state).height
+    radius = annulus.contact.radius(annulus.surface, np.exp(-widths), state[:, 0])
+    rise, pull, pressure, edge = (_series(values, low, high) for values in (height, state[:, -1], state[:, -2], radius))
+    return Panel(places, widths, state, rise, pull, pressure, edge, max(_tail(rise), _tail(pull)), pinned)
+
+
+def neighbour(
+    annulus: Annulus, memory: Memory, width: float, floor: float, counter: Counter
+) -> tuple[list[Panel], list[Panel]] | None:
+    """Return peeling and pinned panels of a scene next to the one remembered; ``None`` if it is too far."""
+    if memory.width != width:
+        return None
+    peel = _moved(annulus, memory.peel, [panel.coordinate for panel in memory.peel], counter)
+    if not peel or peel[-1].height.deriv()(peel[-1].coordinate[-1]) >= 0:
+        return None
+    begin = float(peel[0].height(peel[0].coordinate[0]))
+    if peel[0].coordinate[0] != width:
+        return (peel, []) if begin <= floor else None
+    rises = begin - floor > SHORTEST * (1 + abs(floor))
+    if rises != bool(memory.pinned):
+        return None
+    if not rises:
+        return peel, []
+    low, high = memory.pinned[0].coordinate[0], memory.pinned[-1].coordinate[-1]
+    stretched = [floor + (begin - floor) * ((panel.coordinate - low) / (high - low)) for panel in memory.pinned]
+    pinned = _moved(annulus, memory.pinned, stretched, counter)
+    return None if pinned is None else (peel, pinned)
+
+
+def _moved(annulus: Annulus, known: list[Panel], places: list[Array], counter: Counter) -> list[Panel] | None:
+    """Solve known panels in another scene, all states at once; ``None`` where one is not near."""
+    pinned = known[0].pinned
+    coordinate = np.concatenate(places)
+    widths = np.concatenate([panel.width for panel in known])
+    guess = np.concatenate([panel.state for panel in known])
+    closure = Closure.HEIGHT if pinned else Closure.RELEASE
+    solved = counter.note(solve(annulus, widths, guess, closure=closure, target=coordinate, iterations=6))
+    near = relative_size(solved.state, solved.state - guess, widths) < LARGEST_SURPRISE
+    if not (solved.converged & near).all():
+        return None
+    parts = np.cumsum([panel.width.size for panel in known])[:-1]
+    states = np.split(solved.state, parts)
+    return [
+        _as_panel(annulus, place, panel.width, state, pinned=pinned)
+        for panel, place, state in zip(known, places, states, strict=True)
+    ]
 
 
 def _series(values: Array, low: float, high: float) -> Chebyshev:
