@@ -209,7 +209,7 @@ def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Co
         if found.state is None and not found.turned:
             raise NotConverged("membrane: the state at the start of retraction could not be solved to anchor the gas")
         if found.state is None:
-            return Outcome.NO_EQUILIBRIUM
+            return _no_equilibrium(gas)
         change = float(shape(annulus, np.array([width]), found.state).volume_change[0])
     if gas.free_volume + change <= 0:
         return Outcome.CHAMBER_CLOSED
@@ -225,7 +225,7 @@ def _solve(
             try:
                 branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, order)
                 if not _rises_above_start(scaled, branch):
-                    return replace(empty, outcome=Outcome.NO_EQUILIBRIUM)
+                    return replace(empty, outcome=_no_equilibrium(scaled.annulus.gas))
                 found = _refined(scaled, branch, tolerance, counter, memory, order)
                 break
             except NotConverged:
@@ -235,6 +235,11 @@ def _solve(
     if found.features.peak.pull <= 0:
         return replace(empty, outcome=Outcome.NO_ADHESION)
     return _prediction(scaled, found, empty, points)
+
+
+def _no_equilibrium(gas: Gas) -> Outcome:
+    """Name what peels a contact that holds at no height: suction, or the tension of an inflated membrane."""
+    return Outcome.BLOWN_OFF if gas.pressure > 0 else Outcome.NO_EQUILIBRIUM
 
 
 def _restarted(scaled: Scene, tolerance: float, counter: Counter, memory: Memory) -> Found | None:

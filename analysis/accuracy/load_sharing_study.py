@@ -66,7 +66,7 @@ def _convergence(quick: bool, progress: Progress) -> Section:
         "Load sharing, uniform against graded meshes",
         text,
         {key: table},
-        {key: lambda path: work_precision(table, ERRORS, path)},
+        {key: lambda path: work_precision(table, ERRORS, path, work="unknowns")},
         {key: "Load sharing: work and precision"},
     )
 
@@ -85,15 +85,18 @@ def _locking(quick: bool, progress: Progress) -> Section:
             forces[element] = result.edge_force(LIFTED)
         rows.append(
             {
-                "nu": ratio,
+                "nu": f"{ratio:g}",
                 **{f"{name} over mixed": forces[name] / forces["mixed"] for name in ("P1", "P2")},
                 "mixed (N/m)": forces["mixed"],
             }
         )
-    table = pd.DataFrame(rows)
+    film = Film(FILM.radius, FILM.contact_radius, FILM.thickness, FILM.youngs_modulus, 0.5)
+    limit = solve(film, Formulation.PLANE_STRAIN, estimate_error=False, discretisation=mesh)
+    incompressible = {"nu": "1/2", "mixed (N/m)": limit.edge_force(LIFTED)}
+    table = pd.DataFrame([*rows, incompressible])
     long = pd.DataFrame(
         [
-            {"x": 0.5 - row["nu"], "y": row[f"{name} over mixed"], "series": name}
+            {"x": 0.5 - float(str(row["nu"])), "y": row[f"{name} over mixed"], "series": name}
             for row in rows
             for name in ("P1", "P2")
         ]
@@ -102,7 +105,7 @@ def _locking(quick: bool, progress: Progress) -> Section:
         "Plane strain on one graded mesh: displacement elements stiffen as nu approaches 1/2, linear ones without "
         "bound; the mixed element does not notice and takes nu = 1/2 itself."
     )
-    panel = [("locking", "1/2 - nu", "edge force over that of the mixed element", long)]
+    panel = [("plane strain, stuck edge lifted", "1/2 - nu", "edge force / that of the mixed element", long)]
     return Section(
         "Load sharing, locking",
         text,

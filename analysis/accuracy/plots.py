@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axis import Axis
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -15,8 +16,14 @@ FLOOR = 1e-17
 """Errors below this are drawn here: the solver and the reference agree to the last bit."""
 
 
-def work_precision(table: pd.DataFrame, errors: Sequence[tuple[str, str]], path: Path) -> None:
-    """Draw error against run time and against evaluations, one row of panels per quantity.
+def work_precision(
+    table: pd.DataFrame,
+    errors: Sequence[tuple[str, str]],
+    path: Path,
+    *,
+    work: str = "evaluations of the energy or its derivatives",
+) -> None:
+    """Draw error against run time and against ``work``, the column evaluations, one row of panels per quantity.
 
     The table has the columns method, median_s, lower_s, upper_s, evaluations and one per error (relative); the second
     of each pair in ``errors`` is its label.
@@ -36,9 +43,21 @@ def work_precision(table: pd.DataFrame, errors: Sequence[tuple[str, str]], path:
             panel.set(xscale="log", yscale="log", ylabel=label)
             panel.grid(alpha=0.3)
     axes[-1][0].set_xlabel("run time (s), median and quartiles")
-    axes[-1][1].set_xlabel("evaluations of the energy or its derivatives")
+    axes[-1][1].set_xlabel(work)
     axes[0][1].legend(fontsize=8)
+    for panel in axes.flat:
+        _label_decades(panel.xaxis)
+        _label_decades(panel.yaxis)
     figure.savefig(path, dpi=110)
+
+
+def _label_decades(axis: Axis) -> None:
+    """Label the decades alone where there is more than one in view; their parts would overlap."""
+    from matplotlib.ticker import NullFormatter
+
+    low, high = sorted(axis.get_view_interval())
+    if high >= 10 * low:
+        axis.set_minor_formatter(NullFormatter())
 
 
 def limits(panels: Sequence[tuple[str, str, str, pd.DataFrame]], path: Path) -> None:
@@ -54,6 +73,8 @@ def limits(panels: Sequence[tuple[str, str, str, pd.DataFrame]], path: Path) -> 
             y = part["y"].clip(lower=FLOOR)
             axis.loglog(part["x"], y, MARKERS[k % 7] + "-", color=COLOURS[k % 7], markersize=3.5, label=str(series))
         axis.set(title=title, xlabel=x_label, ylabel=y_label)
+        if table["y"].max() < 10 * table["y"].min():  # less than a decade: plain numbers
+            axis.set_yscale("linear")
         axis.grid(alpha=0.3)
         if table["series"].nunique() > 1:
             axis.legend(fontsize=7)
