@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -219,22 +219,36 @@ def _anchored_at_start(annulus: Annulus, width: float, start: float, counter: Co
 def _solve(
     scaled: Scene, empty: Prediction, points: int, tolerance: float, counter: Counter, memory: Memory
 ) -> Prediction:
-    found = _restarted(scaled, tolerance, counter, memory)
-    if found is None:
-        for order in COARSE_ORDERS:
-            try:
-                branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, order)
-                if not _rises_above_start(scaled, branch):
-                    return replace(empty, outcome=_no_equilibrium(scaled.annulus.gas))
-                found = _refined(scaled, branch, tolerance, counter, memory, order)
-                break
-            except NotConverged:
-                if order == COARSE_ORDERS[-1]:
-                    raise
-    assert found is not None
+    found = _restarted(scaled, tolerance, counter, memory) or _from_nothing(scaled, tolerance, counter, memory)
+    if isinstance(found, Outcome):
+        return replace(empty, outcome=found)
     if found.features.peak.pull <= 0:
         return replace(empty, outcome=Outcome.NO_ADHESION)
     return _prediction(scaled, found, empty, points)
+
+
+def _from_nothing(
+    scaled: Scene, tolerance: float, counter: Counter, memory: Memory, orders: Sequence[int] = COARSE_ORDERS
+) -> Found | Outcome:
+    """Search the branch and refine it; where that leads nowhere, again with shapes of higher order."""
+    branch: list[Line] = []
+    try:
+        branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, orders[0])
+        if not _rises_above_start(scaled, branch):
+            return _no_equilibrium(scaled.annulus.gas)
+        return _refined(scaled, branch, tolerance, counter, memory, orders[0])
+    except NotConverged:
+        if _folds_back(scaled, branch):
+            return Outcome.SELF_CONTACT
+        if len(orders) == 1:
+            raise
+    return _from_nothing(scaled, tolerance, counter, memory, orders[1:])
+
+
+def _folds_back(scaled: Scene, branch: list[Line]) -> bool:
+    """Whether the membrane leaves the line at more than half a turn, where it would lie on the substrate again."""
+    angles = [shape(scaled.annulus, line.coordinate, line.state).peel_angle for line in branch]
+    return any(((angle > math.pi) | (angle < -math.pi / 2)).any() for angle in angles)
 
 
 def _no_equilibrium(gas: Gas) -> Outcome:

@@ -31,10 +31,6 @@ SHORTEST = 1e-9
 """Rise of a pinned part, relative to the heights it lies between, below which it is left out."""
 
 
-SLACK_TAIL = 1e-5
-"""Last terms of the series to which pinned states are resolved where the gap between them limits D_p anyway."""
-
-
 class Panel(NamedTuple):
     """States at Chebyshev points of a coordinate: ln(R_0 / a) where the contact peels, z where it is pinned.
 
@@ -166,7 +162,6 @@ def pinned_panels(annulus: Annulus, peel: Panel, floor: float, resolution: Resol
         bottom = pinned_state(annulus, width, floor, counter).state
         if bottom is not None:
             lines = [pinned_line(annulus, width, bottom, floor, reached, counter), upper]
-            resolution = resolution._replace(tail=max(resolution.tail, SLACK_TAIL))
     return [
         panel
         for line in lines

@@ -22,6 +22,7 @@ class Outcome(StrEnum):
     PULL_OFF = "pull-off"
     NO_EQUILIBRIUM = "no equilibrium: the membrane is drawn off by suction"
     BLOWN_OFF = "no equilibrium: the stretch of the inflated membrane peels it off by itself"
+    SELF_CONTACT = "self-contact: the peeled membrane folds back onto the substrate"
     NEVER_IN_CONTACT = "never in contact"
     NO_ADHESION = "no adhesion: the force never becomes tensile"
     CHAMBER_CLOSED = "the chamber volume vanishes before retraction begins"
