@@ -132,17 +132,11 @@ def solve(
     counter = Counter()
     prediction = Prediction("membrane", Outcome.NO_ADHESION, assumptions)
     if parameters.membrane.work_of_adhesion > 0:
-        scaled = scene(parameters, stretch, tension_field=tension_field)
-        if parameters.gas.anchor is GasAnchor.START:
-            anchored = _anchored_at_start(scaled.annulus, scaled.width, scaled.start, counter)
+        scaled = anchored_scene(parameters, stretch, counter, tension_field=tension_field)
+        if isinstance(scaled, Outcome):
+            prediction = replace(prediction, outcome=scaled)
         else:
-            anchored = scaled.annulus
-        if isinstance(anchored, Outcome):
-            prediction = replace(prediction, outcome=anchored)
-        else:
-            prediction = _solve(
-                replace(scaled, annulus=anchored), prediction, points, tolerance, counter, memory or Memory()
-            )
+            prediction = _solve(scaled, prediction, points, tolerance, counter, memory or Memory())
     return replace(prediction, runtime_s=time.perf_counter() - began, evaluations={"membrane states": counter.states})
 
 
@@ -171,6 +165,17 @@ def scene(parameters: Parameters, stretch: ContactStretch, *, tension_field: boo
         tension_field=tension_field,
     )
     return Scene(annulus, start, width, length, tension * length, pressure)
+
+
+def anchored_scene(
+    parameters: Parameters, stretch: ContactStretch, counter: Counter, *, tension_field: bool = False
+) -> Scene | Outcome:
+    """Return the scene in scaled units with its gas anchored, also at the start of retraction; or why it has none."""
+    scaled = scene(parameters, stretch, tension_field=tension_field)
+    if parameters.gas.anchor is not GasAnchor.START:
+        return scaled
+    anchored = _anchored_at_start(scaled.annulus, scaled.width, scaled.start, counter)
+    return anchored if isinstance(anchored, Outcome) else replace(scaled, annulus=anchored)
 
 
 def _contact(stretch: ContactStretch, surface: Surface, width: float) -> Contact:

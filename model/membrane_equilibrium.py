@@ -366,6 +366,15 @@ def _solve_linear(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], dtype=np.float64)
 
 
+def remaining_step(
+    annulus: Annulus, width: Array, state: Array, closure: Closure, target: Array | float = 0.0
+) -> Array:
+    """Return the relative size (n,) of the Newton step that solved states (n, m) would still take."""
+    targets = np.broadcast_to(np.asarray(target, dtype=float), width.shape)
+    residual, jacobian = residual_and_jacobian(annulus, width, state, closure, targets)
+    return relative_size(state, _newton_step(jacobian, residual), width)
+
+
 def release_slope(annulus: Annulus, width: Array, state: Array) -> Array:
     """Return how fast the energy release rate of solved states rises with the rim, the contact line held.
 
