@@ -30,3 +30,25 @@ def test_cone_deviations_are_the_published_ones():
     for model, published in (("cone", 0.09), ("cone-2017", 0.12)):
         mean = sum(abs(predict(t.parameters, model, points=16).pull_off_force / t.force - 1) for t in tests) / 8
         assert mean == pytest.approx(published, abs=0.02)
+
+
+@pytest.mark.soak
+def test_what_was_tried_starts_from_the_nominal_scene_and_fits_no_test_that_is_called_unexplained():
+    predicted = validation.predictions()
+    table = validation.tried_table(predicted)
+    cells = {change: list(row) for change, *row in table.itertuples(index=False)}
+    measured = [tuple(map(float, cell.split(","))) for cell in next(iter(cells.values()))]
+    for change, row in list(cells.items())[1:]:
+        force, distance = map(float, row[-1].split(","))
+        assert max(abs(force / measured[-1][0] - 1), abs(distance / measured[-1][1] - 1)) > 0.2, change
+    index = next(i for i, t in enumerate(validation.experiments()) if t.substrate == "d_b 15 mm" and t.pressure > 0)
+    nominal = predicted["membrane, eml"][index]
+    assert cells[validation.NOMINAL][0].startswith(f"{nominal.pull_off_force:.3f}")
+
+
+def test_numerical_errors_that_show_are_named():
+    name = "membrane, eml"
+    results = [predict(test.parameters, "membrane", points=16) for test in validation.experiments()]
+    sentence = validation.numerical_errors({name: results})
+    assert "d_b 15 mm, -0.7 kPa" in sentence
+    assert "60 mm" not in sentence
