@@ -1,4 +1,4 @@
-"""The equilibrium branch of the cone model: for every contact radius the largest root in z of dPi/dr = 0.
+"""The equilibrium branch of the cone model: for every contact radius the largest root in z of dPi/dr = 0 (EML Eq. 10).
 
 Parametrised by the contact radius the branch is single valued, so the folds in z (where the contact jumps or
 detaches) are ordinary maxima. The root exists for every radius: where the cone leaves the sphere along its tangent

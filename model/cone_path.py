@@ -1,4 +1,7 @@
-"""The path of one pull-off: pinned at r_i, then along the stable stretches of the branch, with jumps between them."""
+"""The path of one pull-off: pinned at r_i, then along the stable stretches of the branch, with jumps between them.
+
+EML Eq. 10 for the contact, Eq. 11 for the force, Eqs. 12-14 for the start.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,9 @@
 Everything but the shape is as in EML: the contact line stays at r_i while the energy release rate lies below the work
 of adhesion, then peels at equality; the chamber gas follows Boyle's law. The peeling branch is a Chebyshev series in
 ln(R_0 / a), a the reference radius of the contact line: features are roots of series, not points of a grid.
+
+Sources: energy EML Eq. 1 with W_1 the neo-Hookean density of Eq. 2 at the true stretches instead of Eqs. 3 and 4, gas
+Eq. 6, peeling where the energy is stationary in the contact radius (Eq. 10), force Eq. 11, start Eqs. 12-14.
 """
 
 from __future__ import annotations

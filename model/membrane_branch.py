@@ -2,6 +2,7 @@
 
 Every curve is followed by its natural coordinate (load fraction, width ln(R_0 / a) of the annulus, height of the rim),
 with a secant predictor and a step that adapts; only the pull-off fold is a maximum of height and no fold in the width.
+The branch is EML Eq. 10, solved for z at each contact radius.
 """
 
 from __future__ import annotations

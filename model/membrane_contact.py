@@ -1,7 +1,8 @@
 """What the membrane does where it touches the substrate: the choice the papers leave open.
 
 Lengths in units of R_0, energies per reference area and tensions in units of mu h_0. Every assumption gives the
-conditions at the contact line: where it lies, what ties it to the free membrane, and the energy release rate.
+conditions at the contact line (EML Eqs. 1 and 10; cap and height: Eqs. 8 and 9): where it lies, what ties it to the
+free membrane, and the energy release rate.
 """
 
 from __future__ import annotations

@@ -4,6 +4,9 @@ Canonical form: with the nominal meridional tension w_1 and the slope psi, Q = R
 obey r' = lambda_1 Q / N, z' = lambda_1 P / N, Q' = w_2 - p r z', N = hypot(Q, P), and the vertical balance integrates
 to P = p r^2 / 2 + f, where 2 pi f is the pull on the substrate. Only a vanishing tension is singular.
 
+This is the stationarity of EML Eq. 1 over all shapes, derived in ``docs/physics-membrane.md``; gas: EML Eq. 6, with the
+volume of Eq. 7 taken over the true shape; closure ``RELEASE``: EML Eq. 10.
+
 Lengths in units of R_0, tensions of mu h_0, pressures of mu h_0 / R_0. The annulus a <= R <= 1 is mapped by
 R = a^(1 - x): it resolves the layers of a small contact and keeps full precision for a narrow annulus.
 """

@@ -1,8 +1,8 @@
 """The neo-Hookean membrane in terms of its meridional tension.
 
 Energies and tensions are per reference area and width in units of mu h_0 = E_m h_0 / 3, stretches lambda_1 (along the
-meridian) and lambda_2 (hoop); incompressible. Given the nominal meridional tension the meridional stretch follows, so
-that nothing is singular where the membrane turns vertical.
+meridian) and lambda_2 (hoop); incompressible (EML Eq. 2). Given the nominal meridional tension the meridional stretch
+follows, so that nothing is singular where the membrane turns vertical.
 """
 
 from __future__ import annotations

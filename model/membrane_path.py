@@ -1,4 +1,7 @@
-"""The path of the contact from z_0 to detachment, as Chebyshev series, and the features read off it. Scaled units."""
+"""The path of the contact from z_0 to detachment, as Chebyshev series, and the features read off it. Scaled units.
+
+The contact is pinned at r_i until Eq. 10 of EML holds, then follows its largest stable root; F_r is Eq. 11.
+"""
 
 from __future__ import annotations
 

@@ -52,12 +52,16 @@ def work_precision(
 
 
 def _label_decades(axis: Axis) -> None:
-    """Label the decades alone where there is more than one in view; their parts would overlap."""
-    from matplotlib.ticker import NullFormatter
+    """Label the decades alone where several are in view, also 2 and 5 where not: all parts of one would overlap."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = sorted(axis.get_view_interval())
-    if high >= 10 * low:
+    if high >= 100 * low:
         axis.set_minor_formatter(NullFormatter())
+    else:
+        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        for format_with in (axis.set_major_formatter, axis.set_minor_formatter):
+            format_with(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def limits(panels: Sequence[tuple[str, str, str, pd.DataFrame]], path: Path) -> None:
