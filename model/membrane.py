@@ -269,7 +269,10 @@ def _restarted(scaled: Scene, tolerance: float, counter: Counter, memory: Memory
     panels = neighbour(scaled.annulus, memory, scaled.width, scaled.start, counter)
     if panels is None:
         return None
-    found = _read(scaled, *panels, counter)
+    try:
+        found = _read(scaled, *panels, counter)
+    except NotConverged:
+        return None
     reachable = 1.5 * memory.relative if memory.tolerance <= tolerance else 0.0
     if not found.relative <= max(tolerance, reachable):
         return None
@@ -279,6 +282,8 @@ def _restarted(scaled: Scene, tolerance: float, counter: Counter, memory: Memory
 
 def _read(scaled: Scene, peel: list[Panel], pinned: list[Panel], counter: Counter) -> Found:
     pieces = path(peel, pinned, scaled.start)
+    if not pieces:
+        raise NotConverged("membrane: the branch rises above z_0 at a coarse order only")
     read = features(pieces, scaled.start)
     errors = _errors(scaled, read, counter)
     return Found(pieces, read, errors, _relative(read, errors))

@@ -92,7 +92,8 @@ def _one_state(
             value, timing = timed(functools.partial(other_solver, problem, a, guess, tolerance), 2 if quick else 5)
             rows.append(_row(method, f"tol = {tolerance:g}", value, truth, timing, calls))
     table = pd.DataFrame(rows)
-    key = "membrane-" + name.split(" kPa", maxsplit=1)[0].replace(", ", "-").replace(" ", "-") + f"-{a * 8:.0f}mm"
+    place = name.split(" kPa", maxsplit=1)[0].replace(", -", "-minus-").replace(" ", "-")
+    key = f"membrane-{place}-kPa-{a * 8:.0f}-mm"
     text = (
         "One peeling state with the chamber gas coupled, E_m 2 MPa, projected stick. Reference: shooting with DOP853 "
         f"at 1e-13, which differs from itself at 1e-11 by {abs(other.pull / truth.pull - 1):.1e}. "
@@ -149,7 +150,7 @@ def _profile(quick: bool, progress: Progress) -> Section:
         "Membrane, whole profile",
         text,
         {key: table},
-        {key: lambda path: work_precision(table, FEATURES, path)},
+        {key: lambda path: work_precision(table, FEATURES, path, work="states evaluated")},
         {key: "Membrane, whole profile: work and precision"},
     )
 
