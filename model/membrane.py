@@ -56,6 +56,10 @@ HALVINGS = 12
 """How often a panel may be halved: near slack states height and force turn within a narrow range."""
 MEASURED_TAIL = 1e-5
 MEASURED_HALVINGS = 3
+ENDS_HIGHEST = (
+    "membrane: the branch ends where it is highest, so that detachment is unknown; a contact that slides ends where "
+    "the membrane would push it together, leaving at more than a right angle: choose another contact stretch"
+)
 ACCEPTABLE = 1e-3
 """Relative error above which a result is refused instead of returned with its error."""
 
@@ -244,6 +248,8 @@ def _from_nothing(
         branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, orders[0])
         if not _rises_above_start(scaled, branch):
             return _no_equilibrium(scaled.annulus.gas)
+        if _ends_highest(scaled, branch):
+            raise NotConverged(ENDS_HIGHEST)
         return _refined(scaled, branch, tolerance, counter, memory, orders[0])
     except NotConverged:
         if _folds_back(scaled, branch):
@@ -251,6 +257,13 @@ def _from_nothing(
         if len(orders) == 1:
             raise
     return _from_nothing(scaled, tolerance, counter, memory, orders[1:])
+
+
+def _ends_highest(scaled: Scene, branch: list[Line]) -> bool:
+    """Whether the branch breaks off at its highest point towards wider contacts: a higher one may be missing."""
+    heights = [shape(scaled.annulus, line.coordinate, line.state).height for line in branch]
+    highest = int(np.argmax([part.max() for part in heights]))
+    return int(np.argmax(heights[highest])) == 0 and branch[highest].coordinate[0] != scaled.width
 
 
 def _folds_back(scaled: Scene, branch: list[Line]) -> bool:
