@@ -32,7 +32,9 @@ class BoyleFit:
     residual: Array
 
 
-def fit_boyle(pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOSPHERE) -> BoyleFit:
+def fit_boyle(
+    pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOSPHERE, interval: float | None = None
+) -> BoyleFit:
     """Fit V_0 to the volume the pump has put in and the pressure that followed, chamber closed and out of contact.
 
     Isothermal: (P_atm + P_a) (V_0 - dV) = P_atm V_0 with dV the volume the plunger has moved in, so that
@@ -44,6 +46,9 @@ def fit_boyle(pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOS
         (n,), m^3, moved into the chamber.
     pressure
         (n,), Pa gauge.
+    interval
+        Time between the points, s. Given, a leak proportional to P_a is fitted beside V_0: what has left by then is
+        the integral of P_a over its time constant, times V_0.
 
     Raises
     ------
@@ -53,10 +58,15 @@ def fit_boyle(pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOS
     share = pressure / (atmosphere + pressure)
     if pumped.size < 8 or float(np.ptp(share)) < 1e-4:
         raise FeatureMissing("the pressure changed by less than ten pascals; nothing to fit")
-    design = np.stack([share, np.ones_like(share)], axis=1)
+    columns = [share, np.ones_like(share)]
+    if interval is not None:
+        lost = np.concatenate([[0.0], np.cumsum((pressure[1:] + pressure[:-1]) / 2)]) * interval
+        scaled = lost / (atmosphere + pressure)
+        columns.append(scaled / max(float(np.abs(scaled).max()), 1e-30))
+    design = np.stack(columns, axis=1)
     solution, _, _, _ = np.linalg.lstsq(design, pumped, rcond=None)
     residual = np.asarray(pumped - design @ solution, dtype=np.float64)
-    variance = float(residual @ residual) / (pumped.size - 2)
+    variance = float(residual @ residual) / (pumped.size - design.shape[1])
     covariance = np.linalg.inv(design.T @ design) * variance
     return BoyleFit(float(solution[0]), float(np.sqrt(covariance[0, 0])), float(solution[1]), residual)
 
@@ -69,7 +79,7 @@ def fit_boyle(pumped: Array, pressure: Array, atmosphere: float = STANDARD_ATMOS
     after=("segments",),
 )
 def volume(work: Extraction) -> Details:
-    """Fit the straight line dV = V_0 P_a / (P_atm + P_a) to 50 ms means of the whole record.
+    """Fit dV = V_0 P_a / (P_atm + P_a), and a leak beside it, to 50 ms means of the whole record.
 
     Temperature is taken as constant: the pump must move slowly, or wait.
     """
@@ -77,8 +87,10 @@ def volume(work: Extraction) -> Details:
     if run.pump_volume is None or run.pressure is None:
         raise FeatureMissing("the recording holds no pump volume or no pressure")
     atmosphere = STANDARD_ATMOSPHERE if run.parameters is None else run.parameters.gas.atmospheric_pressure
-    length = max(1, round(0.05 * run.rate))
-    fit = fit_boyle(block_means(run.pump_volume, length), block_means(run.pressure, length), atmosphere)
+    length = work.samples(0.05, least=1)
+    fit = fit_boyle(
+        block_means(run.pump_volume, length), block_means(run.pressure, length), atmosphere, length / run.rate
+    )
     work.set(chamber_volume_m3=fit.volume)
     return {"decision": f"V_0 = {fit.volume * 1e6:.3f} mL", "fit": fit}
 
@@ -149,7 +161,7 @@ def leak(work: Extraction) -> Details:
         raise FeatureMissing("the recording holds no pressure or no hold step")
     if run.parameters is None:
         raise FeatureMissing("without parameters the chamber volume is unknown")
-    length = max(1, round(0.1 * run.rate))
+    length = work.samples(0.1, least=1)
     time, gas = (block_means(signal[step.start : step.stop], length) for signal in (run.time, run.pressure))
     volume, atmosphere = run.parameters.gripper.chamber_volume, run.parameters.gas.atmospheric_pressure
     found = fit_leak(time, gas, volume, atmosphere)

@@ -15,9 +15,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from analysis.creep import Creep
 from analysis.errors import FeatureMissing
 from analysis.numerics import Array, ForceJump, LocalFit, Noise, block_means
 from analysis.run import Run
+
+MODULES = ("preparation", "loading", "retraction", "indentation", "chamber")
+"""Modules of ``analysis`` that register steps, in the order in which these are reported."""
+
+SMOOTHING = 0.02
+"""Width of the running mean used to find places (never values), s."""
 
 Details = Mapping[str, object]
 """Decision in words under ``"decision"``; arrays, indices and thresholds for the plot under other keys."""
@@ -37,9 +44,14 @@ class Windows:
 
 @dataclass
 class Extraction:
-    """One pass over one run. Steps set the attributes; those that follow read them."""
+    """One pass over one run. Steps set the attributes; those that follow read them.
+
+    ``creep`` may be given by an earlier pass; ``looks_for_creep`` is false then.
+    """
 
     run: Run
+    creep: Creep | None = None
+    looks_for_creep: bool = True
     values: dict[str, float] = field(default_factory=dict)
     details: dict[str, Details] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
@@ -58,6 +70,7 @@ class Extraction:
     zero_separation: float = field(init=False)
     release: float = field(init=False)
     release_separation: float = field(init=False)
+    recoil: float = field(init=False, default=0.0)
     peak: float = field(init=False)
     peak_fit: LocalFit = field(init=False)
     peak_shift: float = field(init=False)
@@ -65,6 +78,10 @@ class Extraction:
     def set(self, **values: float) -> None:
         """Store features by their registered names."""
         self.values.update(values)
+
+    def samples(self, seconds: float, least: int = 3) -> int:
+        """Return how many samples a time holds, ``least`` at the least."""
+        return max(least, round(seconds * self.run.rate))
 
     def retraction(self) -> tuple[int, int]:
         """Return start and stop of the retraction, or raise ``FeatureMissing``."""
@@ -79,7 +96,7 @@ class Extraction:
     def thinned(self, run: Run, length: int) -> Extraction:
         """Return the state for a run averaged over ``length`` samples: signals, places, decisions."""
         windows = self.windows
-        light = Extraction(run, dict(self.values), missing=dict(self.missing), failed=dict(self.failed))
+        light = Extraction(run, values=dict(self.values), missing=dict(self.missing), failed=dict(self.failed))
         light.methods = self.methods
         light.windows = Windows(
             free=(windows.free[0] // length, windows.free[1] // length),
@@ -136,7 +153,7 @@ CONTACT_TESTS = ("pull_off", "indentation", "fiber", "punch")
 """Protocols that touch a sample and pull it off."""
 
 STEPS: dict[str, ExtractionStep] = {}
-"""Registered steps by name; ``ordered`` puts them in the order they run."""
+"""Registered steps by name, in no particular order; ``ordered`` puts them in the order they run."""
 
 
 def extraction_step(
@@ -205,7 +222,11 @@ def meanings() -> dict[str, str]:
 
 
 def ordered() -> list[ExtractionStep]:
-    """Return the registered steps as they were registered, but each behind those it needs or uses."""
+    """Return the registered steps as their modules list them, but each behind those it needs or uses.
+
+    The order is that of ``MODULES`` and of the lines within a module, whatever was imported first; steps registered
+    elsewhere come last, by the name of their module.
+    """
     done: dict[str, ExtractionStep] = {}
 
     def place(step: ExtractionStep) -> None:
@@ -214,17 +235,25 @@ def ordered() -> list[ExtractionStep]:
                 place(STEPS[name])
         done.setdefault(step.name, step)
 
-    for step in STEPS.values():
+    for step in sorted(STEPS.values(), key=_place_in_source):
         place(step)
     return list(done.values())
 
 
-def extract(run: Run, *, again: bool = False) -> Extraction:
+def _place_in_source(step: ExtractionStep) -> tuple[int, str, int]:
+    module = step.function.__module__
+    known = [f"analysis.{name}" for name in MODULES]
+    place = known.index(module) if module in known else len(known)
+    return place, module, step.function.__code__.co_firstlineno
+
+
+def extract(run: Run, *, before: Extraction | None = None) -> Extraction:
     """Run every step that applies; a step that finds nothing leaves its features missing, with the reason.
 
-    ``again`` leaves out the steps that are done once only.
+    A run that differs a little from one extracted ``before`` keeps its creep, and leaves out the steps done once only.
     """
-    work = Extraction(run)
+    again = before is not None
+    work = Extraction(run) if before is None else Extraction(run, before.creep, looks_for_creep=False)
     for step in ordered():
         if (step.protocols and run.protocol not in step.protocols) or (again and step.once):
             continue

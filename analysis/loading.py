@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from analysis.errors import FeatureMissing
-from analysis.extraction import CONTACT_TESTS, Details, Extraction, extraction_step
+from analysis.extraction import CONTACT_TESTS, SMOOTHING, Details, Extraction, extraction_step
 from analysis.numerics import Array, Noise, fit_around, on_grid, running_mean
 
 ContactMethod = Callable[[Array, Array, float], int]
@@ -136,7 +136,7 @@ def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
     if work.windows.approach is None:
         raise FeatureMissing("the run has no approach")
     start, stop = work.windows.approach
-    width = max(3, round(0.02 * work.run.rate))
+    width = work.samples(SMOOTHING)
     smooth = running_mean(work.force[start:stop], width)
     top = int(np.argmax(smooth))
     if smooth[top] < 8 * work.noise.of_mean(width) or start + top <= work.contact_start:
@@ -169,21 +169,23 @@ def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
     },
 )
 def preload(work: Extraction) -> Details:
-    """Fit around the largest force of approach and preload, in the widest window whose residuals are noise.
+    """Find the largest force of approach, preload and dwell on a 5 ms mean, and fit what follows it.
 
-    The force at the end of the dwell is the mean of its last half second.
+    There the force rises at the approach speed and then relaxes: a corner, which a fit across it would overshoot. So a
+    parabola is fitted from the largest force on, in the widest window whose residuals are noise; its largest value is
+    the preload. The force at the end of the dwell is the mean of its last half second.
     """
     if work.windows.approach is None:
         raise FeatureMissing("the run has no approach")
     start, stop = work.windows.approach
     later = work.windows.dwell[1] if work.windows.dwell else stop
-    width = max(3, round(0.005 * work.run.rate))
+    width = work.samples(0.005)
     smooth = running_mean(work.force[start:later], width)
     index = start + int(np.argmax(smooth))
     if smooth.max() < 8 * work.noise.of_mean(width):
         raise FeatureMissing("no compression above the noise before the retraction")
-    reach = round(0.5 * work.run.rate)
-    place, value = _largest(work.force, index, max(start, index - reach), min(later, index + reach), work.noise)
+    reach = work.samples(0.5)
+    place, value = _largest(work.force, index, min(later, index + reach), work.noise)
     work.set(preload_N=value)
     details: dict[str, object] = {"decision": f"peak of a local fit, {value:.4f} N", "index": place}
     if work.windows.dwell is None:
@@ -196,8 +198,8 @@ def preload(work: Extraction) -> Details:
     return details
 
 
-def _largest(force: Array, index: int, left: int, right: int, noise: Noise) -> tuple[float, float]:
-    fit = fit_around(-force, index, left, right, noise, degree=2)
+def _largest(force: Array, index: int, right: int, noise: Noise) -> tuple[float, float]:
+    fit = fit_around(-force, index, index, right, noise, degree=2)
     place, value = fit.minimum()
     return place, -value
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.extraction import Extraction, extract, meanings, ordered, unit_of
+from analysis.extraction import MODULES, Extraction, extract, meanings, ordered, unit_of
 from analysis.numerics import Array, block_means
 from analysis.propagation import budget
 from analysis.quantity import Features, Quantity
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-for _module in ("preparation", "loading", "retraction", "indentation", "chamber"):  # in the order they are reported
+for _module in MODULES:
     import_module(f"analysis.{_module}")
 
 

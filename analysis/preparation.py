@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from analysis.creep import find_creep, known_creep
 from analysis.errors import AnalysisError, FeatureMissing
-from analysis.extraction import Details, Extraction, Windows, extraction_step
-from analysis.numerics import Array, Noise, block_means, running_mean
+from analysis.extraction import SMOOTHING, Details, Extraction, Windows, extraction_step
+from analysis.numerics import Array, Noise, block_means, find_jumps, running_mean
 from analysis.run import Run
-
-SMOOTHING = 0.02
-"""Width of the running mean used to find places (never values), s."""
 
 WITHOUT_CONTACT = frozenset({"volume", "leak"})
 """Protocols that never touch a sample: any of their samples shows the zero of force."""
@@ -79,12 +77,13 @@ def _moves(height: Array, window: tuple[int, int] | None, direction: int) -> boo
 
 @extraction_step(
     "tare",
-    title="Tare and drift",
+    title="Tare, drift and creep",
     after=("segments",),
     gives={
         "force_noise_N": "standard deviation of one force sample, out of contact",
         "force_drift_N_s": "drift of the zero of force, fitted jointly before contact and after detachment",
-        "baseline_residual_N": "force left after detachment once tare and drift are removed (quality)",
+        "creep_fraction": "share of a compression that the load train loses and gives back after detachment",
+        "baseline_residual_N": "force left after detachment once tare, drift and creep are removed (quality)",
     },
 )
 def tare(work: Extraction) -> Details:
@@ -94,37 +93,58 @@ def tare(work: Extraction) -> Details:
        before it is left out.
     2. The sample has come off when the force ends within a quarter of the largest tension from the level; detachment
        is the last crossing of three per cent of it.
-    3. Block means before contact and after detachment, equally weighted, give level and drift by least squares.
+    3. What the reading loses to creep of the load train is put back, as the bench's calibration says. Without one,
+       creep is looked for in the dwell, and counts where the force comes back in the same way after detachment.
+    4. Block means before contact and after detachment, equally weighted, give level and drift by least squares.
     """
     run = work.run
     free_start, free_stop = work.windows.free
     level = float(np.median(run.force[free_start:free_stop]))
-    noise = Noise.measure(_without_trend(run.force[free_start:free_stop]), _memory(run))
-    width = max(3, round(SMOOTHING * run.rate))
+    memory = work.samples(NOISE_MEMORY, least=1)
+    noise = Noise.measure(_without_trend(run.force[free_start:free_stop]), memory)
+    width = work.samples(SMOOTHING)
     smooth = running_mean(run.force, width)
-    contact = _contact_onset(work, smooth, level, noise.of_mean(width))
-    margin = max(round(0.2 * run.rate), width)
+    contact = _contact_onset(work, smooth, level, noise)
+    margin = max(work.samples(0.2), width)
     before = (free_start, max(free_stop, contact - margin))
     work.contact_start = contact
     work.detached = _rough_detachment(work, smooth, level, noise.of_mean(width))
+    force = _without_creep(work, level, margin)
+    if force is not run.force:
+        work.detached = _rough_detachment(work, running_mean(force, width), level, noise.of_mean(width))
     after = _after_detachment(work, margin)
     windows = [before] if after is None else [before, after]
-    work.baseline = fit_line(run.force, windows)
-    times = np.arange(run.force.size, dtype=np.float64)
-    work.force = run.force - work.baseline(times)
-    residual = np.concatenate([_without_trend(run.force[slice(*window)]) for window in windows])
-    work.noise = Noise.measure(residual, _memory(run))
+    work.baseline = fit_line(force, windows)
+    work.force = force - work.baseline(np.arange(force.size, dtype=np.float64))
+    residual = np.concatenate([_without_trend(force[slice(*window)]) for window in windows])
+    work.noise = Noise.measure(residual, memory)
     work.set(force_noise_N=work.noise.sigma, force_drift_N_s=float(work.baseline.deriv()(0.0)) * run.rate)
     if after is not None:
         work.set(baseline_residual_N=float(work.force[slice(*after)].mean()))
     elif work.windows.retraction is not None:
         work.missing["baseline_residual_N"] = "the recording holds no force-free part after detachment"
-    how = "before contact and after detachment" if after is not None else "before contact only"
-    return {"decision": f"line through {how}", "windows": windows, "baseline": work.baseline, "contact": contact}
+    decision = "line through " + ("before contact and after detachment" if after is not None else "before contact only")
+    if work.creep is not None and work.creep.share:
+        decision += f"; creep of {work.creep.share:.1%} within {work.creep.time_constant:.2g} s put back"
+    return {"decision": decision, "windows": windows, "baseline": work.baseline, "contact": contact}
 
 
-def _memory(run: Run) -> int:
-    return max(1, round(NOISE_MEMORY * run.rate))
+def _without_creep(work: Extraction, level: float, margin: int) -> Array:
+    """Return the force with what the load train's creep has taken from it; the recorded one where none is known."""
+    run, sensors = work.run, work.run.sensors
+    after = _after_detachment(work, margin)
+    if sensors.creep_time > 0:
+        calibrated = (sensors.creep, sensors.creep_uncertainty, sensors.creep_time)
+        work.creep = known_creep(run.force - level, run.rate, *calibrated)
+    elif work.looks_for_creep and work.windows.dwell is not None and after is not None:
+        work.creep = find_creep(run.force - level, run.rate, work.windows.dwell, after)
+    creep = work.creep
+    if creep is None or not creep.share:
+        work.missing["creep_fraction"] = "the force does not creep back after detachment"
+        return run.force
+    work.set(creep_fraction=creep.share)
+    work.stated["creep_fraction"] = creep.uncertainty
+    return run.force + creep.share * creep.response
 
 
 def _without_trend(values: Array) -> Array:
@@ -132,24 +152,33 @@ def _without_trend(values: Array) -> Array:
     return np.asarray(values - np.polynomial.Polynomial.fit(places, values, 1)(places), dtype=np.float64)
 
 
-def _contact_onset(work: Extraction, smooth: Array, level: float, sigma: float) -> int:
+def _contact_onset(work: Extraction, smooth: Array, level: float, noise: Noise) -> int:
     """Return the first sample of contact in the approach, whether the force rises or falls (snap-in) there.
 
     Contact is certain where the force first stays off the tare by one per cent of its largest value. From there back,
-    it began after the last sample within five standard deviations of a line through all samples well before.
+    it began at the first jump of the force, if there is one (snap-in), or else after the last sample within five
+    standard deviations of a line through all samples well before.
     """
     window = work.windows.approach
     if window is None:
         return work.windows.free[1]
+    width = work.samples(SMOOTHING)
+    sigma = noise.of_mean(width)
     force = smooth[window[0] : window[1]] - level
-    departed = (np.abs(force) > max(5 * sigma, 0.01 * float(np.abs(force).max()))).astype(np.float64)
-    ahead = max(2, round(0.2 * work.run.rate))
+    largest = float(np.abs(force).max())
+    departed = (np.abs(force) > max(5 * sigma, 0.01 * largest)).astype(np.float64)
+    ahead = work.samples(0.2, least=2)
     total = np.concatenate([[0.0], np.cumsum(departed), np.full(ahead, departed.sum())])
     share = (total[ahead : ahead + departed.size] - total[: departed.size]) / ahead
     lasting = np.flatnonzero((departed > 0) & (share > 0.8))
     if lasting.size == 0:
         return window[1]
     certain = window[0] + int(lasting[0])
+    snaps = find_jumps(
+        work.run.force[window[0] : certain + ahead], noise, max(4, width), max(8 * sigma, 2e-3 * largest)
+    )
+    if snaps and window[0] + snaps[0].start < certain:
+        return window[0] + snaps[0].start
     before = (work.windows.free[0], max(work.windows.free[1], certain - ahead))
     line = fit_line(work.run.force, [before])
     places = np.arange(before[0], certain, dtype=np.float64)
@@ -165,7 +194,7 @@ def _rough_detachment(work: Extraction, smooth: Array, level: float, sigma: floa
     force = smooth[start:] - level
     lowest = int(np.argmin(force[: stop - start]))
     peak = float(force[lowest])
-    tail = float(np.median(force[-max(8, min(round(0.5 * work.run.rate), (force.size - lowest) // 4)) :]))
+    tail = float(np.median(force[-max(8, min(work.samples(0.5), (force.size - lowest) // 4)) :]))
     if peak > -8 * sigma or tail < 0.25 * peak:
         return None
     tense = np.flatnonzero(force[lowest:] < tail - max(5 * sigma, 0.03 * -peak))
@@ -209,6 +238,6 @@ def compliance(work: Extraction) -> Details:
 def require_adhesion(work: Extraction) -> None:
     """Raise ``FeatureMissing`` unless the retraction shows tension."""
     start, stop = work.retraction()
-    width = max(3, round(SMOOTHING * work.run.rate))
+    width = work.samples(SMOOTHING)
     if float(running_mean(work.force[start:stop], width).min()) > -8 * work.noise.of_mean(width):
         raise FeatureMissing("no tension above the noise in the retraction")

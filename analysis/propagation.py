@@ -27,7 +27,7 @@ def budget(work: Extraction) -> dict[str, dict[str, float]]:
     """Return, for each feature, its standard uncertainty by source."""
     parts: dict[str, dict[str, float]] = {name: {} for name in work.values}
     for source, changed in _systematic(work):
-        for name, value in extract(changed, again=True).values.items():
+        for name, value in extract(changed, before=work).values.items():
             if name in parts:
                 _add(parts[name], source, value - work.values[name])
     for name, spread in _noise(work).items():
@@ -60,6 +60,7 @@ def _systematic(work: Extraction) -> Iterator[tuple[str, Run]]:
             lambda u: replace(run, sensors=replace(sensors, compliance=sensors.compliance + u)),
         ),
         ("drift", _drift_excess(work), lambda u: replace(run, force=run.force + _bump(work, u))),
+        ("creep", 0.0 if work.creep is None else work.creep.uncertainty, lambda u: _crept(work, u)),
     ]
     pressure = run.pressure
     if pressure is not None:
@@ -94,7 +95,7 @@ def _drift_excess(work: Extraction) -> float:
         return abs(float(work.baseline.deriv()(0.0))) * (work.windows.end - work.contact_start) / 2
     (_, left), (right, _) = windows
     middle = np.linspace(left, right, 9)
-    bend = fit_line(work.run.force, windows, degree=3)(middle) - work.baseline(middle)
+    bend = fit_line(work.force, windows, degree=3)(middle)
     drift = float(work.baseline(right) - work.baseline(left))
     return float(np.sqrt(np.mean(bend**2) + (0.25 * drift) ** 2))
 
@@ -108,6 +109,15 @@ def _bump(work: Extraction, height: float) -> Array:
     return bump
 
 
+def _crept(work: Extraction, share: float) -> Run:
+    """Return the run with another share of creep, calibrated or put back while in contact."""
+    run, sensors = work.run, work.run.sensors
+    if sensors.creep_time > 0:
+        return replace(run, sensors=replace(sensors, creep=sensors.creep + share))
+    assert work.creep is not None
+    return replace(run, force=run.force + _bump(work, share) * work.creep.response)
+
+
 def _noise(work: Extraction) -> Mapping[str, float]:
     generator = np.random.default_rng(SEED)
     run = work.run
@@ -117,7 +127,7 @@ def _noise(work: Extraction) -> Mapping[str, float]:
         changed = replace(run, force=run.force + work.noise.draw(run.force.size, generator))
         if run.pressure is not None and pressure_noise is not None:
             changed = replace(changed, pressure=run.pressure + pressure_noise.draw(run.pressure.size, generator))
-        for name, value in extract(changed, again=True).values.items():
+        for name, value in extract(changed, before=work).values.items():
             if name in samples:
                 samples[name].append(value - work.values[name])
     return {name: _spread(np.array(values)) for name, values in samples.items() if len(values) >= DRAWS // 2}
@@ -138,18 +148,21 @@ def _pressure_noise(work: Extraction) -> Noise | None:
     part = work.run.pressure[start:stop]
     places = np.arange(part.size, dtype=np.float64)
     residual = np.asarray(part - np.polynomial.Polynomial.fit(places, part, 1)(places), dtype=np.float64)
-    return Noise.measure(residual, max(1, round(0.1 * work.run.rate)))
+    return Noise.measure(residual, work.samples(0.1, least=1))
 
 
 def _sampling(work: Extraction) -> dict[str, float]:
-    """Return what the finite sample rate adds: a jump is known to within its samples, a peak to within its bias."""
+    """Return what the finite sample rate adds: a jump to within its samples, a peak to within its bias.
+
+    Within the sample that loses the contact the force may have run away by nothing or by twice the correction; the
+    load train springs back by so much.
+    """
     found: dict[str, float] = {}
     values = work.values
     if "pull_off_distance_m" in values:
-        speed = _speed(work, work.release)
-        width = values.get("snap_duration_s", 1 / work.run.rate) * work.run.rate
+        travel = _speed(work, work.release) / np.sqrt(12.0)
         stage = np.hypot(_stage_noise(work, work.release), _stage_noise(work, work.zero))
-        found["pull_off_distance_m"] = float(np.hypot(speed * max(width, 1.0) / np.sqrt(12.0), stage))
+        found["pull_off_distance_m"] = float(np.sqrt(travel**2 + work.recoil**2 / 3 + stage**2))
     if "pull_off_force_N" in values:
         found["pull_off_force_N"] = values["sampling_bias_N"]
         found["retraction_at_pull_off_m"] = _speed(work, work.peak) * float(np.hypot(work.peak_shift, 12.0**-0.5))
@@ -160,7 +173,7 @@ def _sampling(work: Extraction) -> dict[str, float]:
 
 def _stage_noise(work: Extraction, index: float) -> float:
     """How far the stage's position scatters about a steady motion within half a second, m."""
-    reach = max(8, round(0.25 * work.run.rate))
+    reach = work.samples(0.25, least=8)
     part = work.run.height[max(0, int(index) - reach) : int(index) + reach]
     places = np.arange(part.size, dtype=np.float64)
     return float(np.std(part - np.polynomial.Polynomial.fit(places, part, 1)(places)))
@@ -168,6 +181,6 @@ def _stage_noise(work: Extraction, index: float) -> float:
 
 def _speed(work: Extraction, index: float) -> float:
     """Travel per sample around an index, m."""
-    reach = max(4, round(0.05 * work.run.rate))
+    reach = work.samples(0.05, least=4)
     left, right = max(0, int(index) - reach), min(work.run.height.size - 1, int(index) + reach)
     return abs(float(work.run.height[right] - work.run.height[left])) / (right - left)

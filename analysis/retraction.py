@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.errors import FeatureMissing
-from analysis.extraction import CONTACT_TESTS, Details, Extraction, extraction_step
-from analysis.numerics import Array, LocalFit, Noise, find_jumps, fit_around, fit_window, running_mean
-from analysis.preparation import SMOOTHING, require_adhesion
+from analysis.extraction import CONTACT_TESTS, SMOOTHING, Details, Extraction, extraction_step
+from analysis.numerics import Array, ForceJump, LocalFit, Noise, find_jumps, fit_around, fit_window, running_mean
+from analysis.preparation import require_adhesion
 
 
 @extraction_step(
@@ -30,7 +30,7 @@ def zero_crossing(work: Extraction) -> Details:
     """
     require_adhesion(work)
     start, stop = work.retraction()
-    width = max(3, round(SMOOTHING * work.run.rate))
+    width = work.samples(SMOOTHING)
     smooth = running_mean(work.force[start:stop], width)
     lowest = int(np.argmin(smooth))
     compressed = np.flatnonzero(smooth[: lowest + 1] > 0)
@@ -60,7 +60,7 @@ def _force_at_zero(work: Extraction, start: int) -> float:
     """Zero by definition, unless the force is tensile from the start."""
     if work.zero > start:
         return 0.0
-    width = max(3, round(SMOOTHING * work.run.rate))
+    width = work.samples(SMOOTHING)
     return float(work.force[start : start + width].mean())
 
 
@@ -85,7 +85,7 @@ def jumps(work: Extraction) -> Details:
     A line fitted on either side of each candidate must confirm it, so that steep but smooth stretches do not count.
     """
     start, stop = work.retraction()
-    width = max(4, round(SMOOTHING * work.run.rate))
+    width = work.samples(SMOOTHING, least=4)
     tension = -float(running_mean(work.force[start:stop], width).min())
     reach = min(work.windows.end, stop + 8 * width)
     shifted = find_jumps(work.force[start:reach], work.noise, width, 0.01 * tension)
@@ -104,19 +104,22 @@ def jumps(work: Extraction) -> Details:
     protocols=CONTACT_TESTS,
     after=("jumps",),
     gives={
-        "pull_off_distance_m": "D_p: separation at full detachment minus that at the zero of force",
+        "pull_off_distance_m": "D_p: separation at the last contact minus that at the zero of force",
         "snap_force_N": "tension just before the final jump",
         "snap_duration_s": "duration of the final jump",
     },
 )
 def detachment(work: Extraction) -> Details:
-    """Detachment is the last jump that leaves less than a quarter of the tension to what is left in the end; half-way.
+    """Detachment is the last jump that leaves less than a quarter of the tension to what is left in the end.
 
-    Without such a jump: where the tension, fitted by a line over its last part, falls below four standard deviations
-    of a 20 ms mean. The separation is the stage's height then, corrected by the compliance for the force just before.
+    1. The contact is lost after the last sample of the jump that still stands out of the force after it.
+    2. The separation is the stage's height half a sample later, less the load train's stretch, compliance times force:
+       the train springs back only when the contact is lost. Contacts run away before that: within the sample that is
+       not seen the force is taken to fall by twice as much as in the one before, and by that much uncertain.
+    3. Without such a jump: where the tension falls below four standard deviations of a 20 ms mean.
     """
     start, _ = work.retraction()
-    width = max(4, round(SMOOTHING * work.run.rate))
+    width = work.samples(SMOOTHING, least=4)
     noise = work.noise.of_mean(width)
     smooth = running_mean(work.force[start : work.windows.end], width)
     if work.detached is None:
@@ -125,19 +128,30 @@ def detachment(work: Extraction) -> Details:
     releases = [j for j in work.jumps if j.size > 0 and tail - j.after < 0.25 * (tail - j.before)]
     if releases:
         jump = releases[-1]
-        work.release = jump.middle
-        before = jump.before
-        work.set(snap_force_N=-before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
+        last = _last_tense(work, jump)
+        work.release = last + 0.5
+        fall = float(work.force[last] - work.force[last - 1])
+        held = min(float(work.force[last]) + 2 * fall, 0.0)
+        work.recoil = work.run.sensors.compliance * abs(held - float(work.force[last]))
+        work.set(snap_force_N=-jump.before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
         decision = f"jump of {jump.size * 1e3:.1f} mN within {(jump.stop - jump.start) / work.run.rate * 1e3:.3g} ms"
     else:
         tense = np.flatnonzero(smooth[: work.detached + 2 * width - start] < -4 * noise)
         work.release = float(start + (tense[-1] if tense.size else 0))
-        before = float(smooth[int(work.release) - start])
+        held = float(smooth[int(work.release) - start])
         work.missing.update(dict.fromkeys(("snap_force_N", "snap_duration_s"), "the tension fades without a jump"))
         decision = "the tension fades into the noise"
-    work.release_separation = work.at(work.run.height, work.release) + work.run.sensors.compliance * before
+    work.release_separation = work.at(work.run.height, work.release) + work.run.sensors.compliance * held
     work.set(pull_off_distance_m=work.release_separation - work.zero_separation)
     return {"decision": decision, "index": work.release}
+
+
+def _last_tense(work: Extraction, jump: ForceJump) -> int:
+    """Return the last sample that noise, and three per cent of the jump, do not explain as being after it."""
+    first = jump.stop - 1
+    lacking = jump.after - work.force[first : 2 * jump.stop - jump.start + 2]
+    tense = np.flatnonzero(lacking > max(4 * work.noise.sigma, 0.03 * jump.size))
+    return first + (int(tense[-1]) if tense.size else 0)
 
 
 @extraction_step(
@@ -159,7 +173,7 @@ def pull_off(work: Extraction) -> Details:
     """
     start, stop = work.retraction()
     left, right = max(start, int(np.floor(work.zero))), min(stop, work.windows.end)
-    width = max(3, round(0.005 * work.run.rate))
+    width = work.samples(0.005)
     index = left + int(np.argmin(running_mean(work.force[left:right], width)))
     index, left, right = _side_of_jump(work, index, left, right)
     fit = fit_around(work.force, index, left, right, work.noise)
@@ -274,13 +288,13 @@ def pressure(work: Extraction) -> Details:
     if signal is None:
         raise FeatureMissing("the scene has no pressure")
     start, _ = work.retraction()
-    length = max(8, round(0.5 * work.run.rate))
+    length = work.samples(0.5, least=8)
     window = (max(0, start - length), start) if start > 16 else (start, start + length)
     places = np.arange(*window, dtype=np.float64)
     line = np.polynomial.Polynomial.fit(places, signal[slice(*window)], 1)
     residual = np.asarray(signal[slice(*window)] - line(places), dtype=np.float64)
     work.set(initial_pressure_Pa=float(line(start)), pressure_noise_Pa=float(residual.std()))
-    half = max(1, round(0.05 * work.run.rate))
+    half = work.samples(0.05, least=1)
     for name, index in (("pull_off", getattr(work, "peak", None)), ("detachment", getattr(work, "release", None))):
         if index is None:
             work.missing[f"pressure_at_{name}_Pa"] = f"no {name.replace('_', '-')}"
@@ -320,14 +334,14 @@ def gas_work(work: Extraction) -> Details:
         if run.pump_volume is not None:
             work.set(pump_work_J=float(np.trapezoid(run.pressure[part], run.pump_volume[part])))
         else:
-            width = max(1, round(SMOOTHING * run.rate))
+            width = work.samples(SMOOTHING, least=1)
             gas = running_mean(run.pressure[part], width)
             work.set(pump_work_J=float(np.trapezoid(gas, volume * (gas - gas[0]) / (atmosphere + gas))))
     else:
         work.missing["pump_work_J"] = reason
     start, stop = work.retraction()
     last = int(getattr(work, "release", stop - 1))
-    gas = running_mean(run.pressure[start : last + 1], max(1, round(SMOOTHING * run.rate)))
+    gas = running_mean(run.pressure[start : last + 1], work.samples(SMOOTHING, least=1))
     work.set(gas_work_J=float(np.trapezoid(gas, volume * (atmosphere + gas[0]) / (atmosphere + gas))))
     return {"decision": "pump volume recorded" if run.pump_volume is not None else "volume from Boyle's law"}
 

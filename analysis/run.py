@@ -40,6 +40,9 @@ class Sensors:
     compliance, compliance_uncertainty
         C of load cell, fixture and frame, m/N. A compressed load train lets the gripper stay behind the stage:
         true separation = height + F C (height rises away from the sample, F is positive in compression).
+    creep, creep_uncertainty, creep_time
+        Share of a compression that the load train loses to the reading little by little, its standard uncertainty,
+        and the time constant, s. A time of zero: never measured, each run is searched for it (``analysis.creep``).
     """
 
     force_gain: float = 0.0
@@ -50,6 +53,9 @@ class Sensors:
     compliance: float = 0.0
     compliance_uncertainty: float = 0.0
     pump_volume: float = 0.0
+    creep: float = 0.0
+    creep_uncertainty: float = 0.0
+    creep_time: float = 0.0
 
 
 @dataclass(frozen=True)

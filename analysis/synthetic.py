@@ -159,7 +159,7 @@ def pull_off_run(
         sensors=sensors or Sensors(),
         settings=dict(test.settings),
     )
-    return run, _truth(profile, test)
+    return run, _truth(profile, test, flaws.compliance, phase)
 
 
 def _segments(
@@ -242,7 +242,8 @@ def _noise(generator: np.random.Generator, count: int, flaws: Imperfections) -> 
     return np.asarray(lfilter([scale], [1, -flaws.colour], white), dtype=np.float64)
 
 
-def _truth(profile: Profile, test: Experiment) -> dict[str, float]:
+def _truth(profile: Profile, test: Experiment, compliance: float, phase: float) -> dict[str, float]:
+    """The contact is lost at the end of the snap; till then the stage goes on and the load train springs back."""
     force, place = profile.force, profile.retraction
     lowest = int(np.argmin(force))
     compressed = np.flatnonzero(force[: lowest + 1] > 0)
@@ -254,14 +255,16 @@ def _truth(profile: Profile, test: Experiment) -> dict[str, float]:
     tense = place >= zero
     path = np.concatenate([[zero], place[tense]])
     pull = np.concatenate([[float(np.interp(zero, place, force))], force[tense]])
+    snap = round(test.snap * test.rate)
+    further = (snap + 1 - phase) * test.retract_speed / test.rate - compliance * float(force[-1]) if snap else 0.0
     return {
         "pull_off_force_N": -float(force.min()),
-        "pull_off_distance_m": float(place[-1]) - zero,
+        "pull_off_distance_m": float(place[-1]) + further - zero,
         "retraction_at_pull_off_m": float(place[lowest]) - zero,
         "preload_N": test.preload,
         "initial_pressure_Pa": float(profile.pressure[0]),
         "pressure_at_pull_off_Pa": float(profile.pressure[lowest]),
-        "adhesion_energy_J": -float(np.trapezoid(pull, path)),
+        "adhesion_energy_J": -float(np.trapezoid(pull, path)) - float(force[-1]) * further / 2,
     }
 
 

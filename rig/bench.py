@@ -39,7 +39,10 @@ class StageSection(Section):
 
 
 class PumpSection(Section):
-    """``[pump]``: KD Scientific Legato with the syringe that is in it."""
+    """``[pump]``: KD Scientific Legato with the syringe that is in it.
+
+    ``volume_uncertainty_percent`` is that of a volume it moves: the syringe's diameter and the mechanism together.
+    """
 
     connection: str
     model: str = "Legato"
@@ -48,6 +51,7 @@ class PumpSection(Section):
     syringe_diameter_mm: Annotated[float, Field(gt=0, le=50)]
     syringe_volume_ml: Annotated[float, Field(gt=0, le=200)]
     force_percent: Annotated[int, Field(ge=1, le=100)] = 50
+    volume_uncertainty_percent: Annotated[float, Field(ge=0, le=20)] = 0.5
     reply_timeout_ms: Annotated[float, Field(ge=20, le=5000)] = 500.0
     settle_ms: Annotated[float, Field(ge=0, le=5000)] = 200.0
 
@@ -78,7 +82,11 @@ class CalibrationSection(Section):
 
 
 class ForceSection(Section):
-    """``[force]``: load cell. ``calibration``: N per V (amplified) or N per mV/V (bridge)."""
+    """``[force]``: load cell. ``calibration``: N per V (amplified) or N per mV/V (bridge).
+
+    ``creep_percent`` of a compression is lost to the reading within ``creep_time_s``, and comes back as slowly; a time
+    of zero says that it was never measured.
+    """
 
     channel: str
     cell: str = "GSO-500"
@@ -92,6 +100,9 @@ class ForceSection(Section):
     compression_positive: bool = True
     compliance_um_per_N: Annotated[float, Field(ge=0)] = 0.0
     compliance_uncertainty_um_per_N: Annotated[float, Field(ge=0)] = 0.0
+    creep_percent: Annotated[float, Field(ge=0, le=30)] = 0.0
+    creep_uncertainty_percent: Annotated[float, Field(ge=0, le=30)] = 0.0
+    creep_time_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
     calibration: CalibrationSection
 
 

@@ -14,6 +14,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -81,14 +82,14 @@ class PlannedTest:
 
 
 def load_campaign(path: Path) -> tuple[Campaign, list[PlannedTest]]:
-    """Read and check a campaign file and every scene in it.
+    """Read and check a campaign file, or one that ships by its name, and every scene in it.
 
     Raises
     ------
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    text = read_text(path, "campaign")
+    text = _text(path)
     try:
         campaign = Campaign.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
@@ -96,6 +97,13 @@ def load_campaign(path: Path) -> tuple[Campaign, list[PlannedTest]]:
     except ValidationError as error:
         raise FileError(explain("campaign", str(path), error, Campaign)) from error
     return campaign, list(_ordered(campaign, list(_tests(campaign, path.parent))))
+
+
+def _text(path: Path) -> str:
+    shipped = files("campaigns").joinpath(f"{path}.toml")
+    if path.name == str(path) and not path.suffix and not path.exists() and shipped.is_file():
+        return shipped.read_text("utf-8")
+    return read_text(path, "campaign")
 
 
 def single(scene: Scene, text: str, stem: str, repeats: int, seed: int) -> list[PlannedTest]:

@@ -282,6 +282,10 @@ def sensors(bench: Bench) -> Sensors:
         position=1e-5,
         compliance=bench.force.compliance_um_per_N * 1e-6,
         compliance_uncertainty=bench.force.compliance_uncertainty_um_per_N * 1e-6,
+        pump_volume=bench.pump.volume_uncertainty_percent * 1e-2 if bench.pump else 0.0,
+        creep=bench.force.creep_percent * 1e-2,
+        creep_uncertainty=bench.force.creep_uncertainty_percent * 1e-2,
+        creep_time=bench.force.creep_time_s,
     )
 
 

@@ -43,4 +43,4 @@ def test_68_percent_intervals_hold_the_truth_in_60_to_76_percent(kind: str, test
     for row in table.itertuples():
         assert row.missing == 0, row
         assert 0.60 <= row.within_one_uncertainty <= 0.76, row
-        assert abs(row.mean_deviation) < 0.4, row
+        assert abs(row.mean_deviation) < 0.25, row

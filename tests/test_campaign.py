@@ -67,6 +67,13 @@ def test_table_s1_is_eight_conditions_five_times():
         assert f"initial_pressure_kPa = {test.scene.protocol.initial_pressure_kPa!r}" in test.scene_text
 
 
+def test_a_campaign_that_ships_is_found_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert len(load_campaign(Path("table-s1"))[1]) == 40
+    with pytest.raises(FileError, match="no such file"):
+        load_campaign(Path("table-s9"))
+
+
 def test_random_order_belongs_to_the_seed(tmp_path, campaign):
     first = keys(campaign)
     assert keys(campaign) == first

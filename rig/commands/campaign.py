@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("file", type=Path, help="campaign file")
+    parser.add_argument("file", type=Path, help="campaign file, or the name of one that ships")
     parser.add_argument("--bench", type=Path, help="bench file; without one everything is emulated")
     parser.add_argument("--out", type=Path, help="folder of the recordings (default: recordings/<campaign>)")
     parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
