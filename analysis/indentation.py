@@ -239,6 +239,9 @@ def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float
 def contact_models(work: Extraction) -> Details:
     """Fit JKR and DMT to the attached part of the retraction, F against z, and keep the better.
 
+    A contact line that is pinned at first (hysteresis) fits neither: the uncertainty holds how far the same model moves
+    when it is fitted to the tension alone, and the spread between the two models.
+
     Maugis has one parameter more and is fitted on request only (``fit_contact``): it follows noise where the others
     suffice.
     """
@@ -246,12 +249,22 @@ def contact_models(work: Extraction) -> Details:
     part = slice(start, int(work.release))
     radius = indenter_radius(work.run)
     fits = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
+    tense = slice(max(start, int(work.zero)), int(work.release))
+    other = fit_contact(work.separation[tense], work.force[tense], radius, models=(fits[0].model,))[0]
     best, gain = fits[0], work.run.sensors.force_gain
     work.set(fitted_work_of_adhesion_J_m2=best.work_of_adhesion, fitted_modulus_Pa=best.modulus)
     work.stated["fitted_work_of_adhesion_J_m2"] = math.hypot(
-        best.work_of_adhesion_uncertainty, gain * best.work_of_adhesion
+        best.work_of_adhesion_uncertainty,
+        gain * best.work_of_adhesion,
+        best.work_of_adhesion - other.work_of_adhesion,
+        (best.work_of_adhesion - fits[1].work_of_adhesion) / 12**0.5,
     )
-    work.stated["fitted_modulus_Pa"] = math.hypot(best.modulus_uncertainty, gain * best.modulus)
+    work.stated["fitted_modulus_Pa"] = math.hypot(
+        best.modulus_uncertainty,
+        gain * best.modulus,
+        best.modulus - other.modulus,
+        (best.modulus - fits[1].modulus) / 12**0.5,
+    )
     words = "; ".join(
         f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in fits
     )
