@@ -149,7 +149,7 @@ def _replacing(path: Path) -> Iterator[Path]:
         sync(fresh)
         os.replace(fresh, path)
         sync_folder(path)
-    except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
         fresh.unlink(missing_ok=True)
         raise FileError(
             f"recording {path}: cannot be repaired ({error}). It is left as it was. Remedy: free space beside it "

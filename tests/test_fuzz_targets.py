@@ -17,6 +17,7 @@ FOUND = [
     ("scene files", b'[substrate]\nshape = "flat"\n[protocol]\nname = "pul\\t_off"\n'),
     ("scene files", b'[substrate]\nshape = "flat"\n"\\u001b[2J" = 1\n'),
     ("gRPC replies", b"\5\0" * 60),
+    ("journals", b"\r\0\0\5\0\x90" + bytes(7) + b"\2^"),
 ]
 
 
