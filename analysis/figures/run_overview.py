@@ -88,7 +88,7 @@ def _smooth(values: Array, rate: float) -> Array:
 
 def draw_against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
     """Draw force and pressure of a whole run against time, with the six moments of EML Fig. 2."""
-    axes.set_title(run.name, loc="left")
+    axes.set_title(run.name, loc="left", pad=18)  # above the words of the six moments
     axes.plot(*thin(run.time, analysis.force), color=BLUE, linewidth=1.0)
     _force_axis(axes)
     axes.set_xlabel("Time t [s]")
@@ -112,7 +112,7 @@ def draw_against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
             zorder=6,
         )
     words = "   ".join(f"{number} {name}" for number, (_, name) in places.items())
-    axes.text(1.0, 1.02, words, transform=axes.transAxes, ha="right", va="bottom", fontsize=7.5, color="#333333")
+    axes.text(0.0, 1.02, words, transform=axes.transAxes, ha="left", va="bottom", fontsize=7.5, color="#333333")
 
 
 def markers(run: Run, analysis: Analysis) -> dict[int, tuple[float, str]]:
