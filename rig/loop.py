@@ -153,7 +153,7 @@ class Loop:
     Parameters
     ----------
     frame_samples
-        Samples in a frame.
+        Samples in a frame; a frame that comes late is followed by one longer by what has come in meanwhile.
     pump_frames
         The pump is polled once in so many frames.
     """
@@ -225,14 +225,14 @@ class Loop:
         self._stage_status = stage.status()
         daq.start()
         timebase = TimeBase(daq.rate)
-        number = 0
+        number = waiting = 0
         while True:
-            volts = daq.read(self._frame_samples)
+            volts = daq.read(self._frame_samples * (1 + waiting))
             arrived = clock()
             force, pressure = self._checked(volts)
             self._stage_status = status = stage.status()
             frame = Frame(number, self.samples, daq.rate, volts, force, pressure, status, self._poll_pump(number))
-            self._take(frame, timebase, arrived)
+            waiting = int(self._take(frame, timebase, arrived) * daq.rate / self._frame_samples)
             yield frame
             number += 1
 
@@ -258,10 +258,13 @@ class Loop:
         self._record(frame, np.full(force.size, status.position), self._instruments.clock())
         self._reporter.notify("frame", frame)
 
-    def _take(self, frame: Frame, timebase: TimeBase, arrived: float) -> None:
+    def _take(self, frame: Frame, timebase: TimeBase, arrived: float) -> float:
+        """Return how late the frame was, s; what has come in meanwhile is read at once."""
         height = timebase.place(frame.start, frame.force.size, arrived, frame.stage)
         self._record(frame, height, arrived)
-        self._interlocks.check_motion(frame.stage, timebase.lag(frame.stop, arrived))
+        lag = timebase.lag(frame.stop, arrived)
+        self._interlocks.check_motion(frame.stage, lag)
+        return lag
 
     def _record(self, frame: Frame, height: Array, arrived: float) -> None:
         if self._store is not None:

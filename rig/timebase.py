@@ -1,11 +1,13 @@
 """Samples, polls and the clock: where the stage stood at each sample.
 
-The DAQ counts samples and knows no clock; polls carry bench time. The earliest arrival seen in a window of frames,
-less index / rate, is the offset between both: late arrivals are ignored rather than averaged.
+The DAQ counts samples and knows no clock; polls carry bench time. The earliest arrival of a frame, less index / rate,
+is the offset between both: what comes later than that is late. Only as fast as two clocks can drift apart may the
+offset rise, so a program that falls behind more and more does not take its own delay for the time.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -13,7 +15,8 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import StageStatus
 
-WINDOW_FRAMES = 64
+CLOCKS_APART = 2e-4
+"""How much faster one clock may run: 50 ppm for the DAQ (NI 6211 specifications), 100 ppm for a computer, a margin."""
 
 
 class TimeBase:
@@ -24,29 +27,26 @@ class TimeBase:
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
-        self._offsets: deque[float] = deque(maxlen=WINDOW_FRAMES)
-        self._last: tuple[float, float] | None = None
-
-    @property
-    def offset(self) -> float:
-        """Bench time of sample 0, s: the lower envelope over the window."""
-        return min(self._offsets)
+        self._polls: deque[tuple[float, float]] = deque()
+        self.offset = math.inf
+        """Bench time of sample 0, s."""
 
     def place(self, start: int, count: int, arrived: float, stage: StageStatus) -> NDArray[np.float64]:
-        """Return the stage's position at each sample of a frame, m, linear between the poll before and this one.
+        """Return the stage's position at each sample of a frame, m, linear between the polls around it.
 
         In the first frame it is this poll's position.
         """
-        self._offsets.append(arrived - (start + count) / self._rate)
-        now = _point(stage)
+        self.offset = min(self.offset + CLOCKS_APART * count / self._rate, arrived - (start + count) / self._rate)
         times = self.offset + np.arange(start, start + count) / self._rate
-        last = self._last or now
-        height = np.interp(times, (last[0], now[0]), (last[1], now[1]))
-        self._last = now
+        self._polls.append(_point(stage))
+        while len(self._polls) > 2 and self._polls[1][0] <= times[0]:
+            self._polls.popleft()
+        moments, positions = zip(*self._polls, strict=True)
+        height: NDArray[np.float64] = np.interp(times, moments, positions)
         return height
 
     def lag(self, stop: int, arrived: float) -> float:
-        """Return how much later than the earliest in the window a frame came, s."""
+        """Return how much later than its samples a frame came, s."""
         return arrived - stop / self._rate - self.offset
 
 
