@@ -18,6 +18,9 @@ from model import jkr
 POINTS = 300
 """The retraction curve is averaged into so many points before a fit."""
 
+WIDEST = 7.0
+"""Work of adhesion, modulus and strength are sought within this logarithm of the first guess."""
+
 
 def indenter_radius(run: Run) -> float:
     """Return R, m, from the scene.
@@ -99,6 +102,8 @@ class ContactFit:
         J/m^2 and contact modulus E*, Pa; with standard uncertainties from the fit's covariance.
     origin
         Separation at first touch, m.
+    corner
+        Separation at which the contact line begins to recede, m; below it is pinned.
     strength
         Cohesive strength of Maugis, Pa; ``nan`` for the others.
     misfit
@@ -113,6 +118,7 @@ class ContactFit:
     modulus: float
     modulus_uncertainty: float
     origin: float
+    corner: float
     strength: float
     misfit: float
     separation: Array
@@ -134,7 +140,13 @@ def fit_contact(
     Returns
     -------
     list
-        One fit per model, best first. Free are w, E*, the origin and, for Maugis, the cohesive strength.
+        One fit per model, best first. Free are w, E*, the origin, the separation at which the contact line begins to
+        recede and, for Maugis, the cohesive strength.
+
+    Notes
+    -----
+    At first the line is pinned (adhesion hysteresis): down to the depth where it begins to recede, force and depth are
+    linear, with the stiffness 2 E* a of a punch of the contact radius a there (Johnson 1971).
 
     Raises
     ------
@@ -148,72 +160,104 @@ def fit_contact(
     return sorted((_fit(model, place, pull, radius) for model in models), key=lambda fit: fit.misfit)
 
 
-def _jkr(depth: Array, logs: Array, radius: float) -> Array:
+def _jkr(depth: Array, logs: Array, radius: float) -> tuple[Array, Array]:
     work, modulus = (float(value) for value in np.exp(logs[:2]))
     pull = math.pi * work / (2 * modulus)
     root = (radius * math.sqrt(pull) / 2) ** (1 / 3)
     fold = root**4 / radius - 2 * math.sqrt(pull) * root
-    return jkr.jkr_force(np.maximum(depth, fold * (1 - 1e-12)), work, radius, modulus)
+    reached = np.maximum(depth, fold * (1 - 1e-12))
+    contact = jkr.jkr_contact_radius(reached, work, radius, modulus)
+    return 4 * modulus * (contact**3 / (3 * radius) - np.sqrt(pull * contact**3)), contact
 
 
-def _dmt(depth: Array, logs: Array, radius: float) -> Array:
+def _dmt(depth: Array, logs: Array, radius: float) -> tuple[Array, Array]:
     work, modulus = np.exp(logs[:2])
     contact = np.sqrt(np.maximum(depth, 0.0) * radius)
-    return np.asarray(4 * modulus * contact**3 / (3 * radius) - 2 * np.pi * radius * work, dtype=np.float64)
+    return 4 * modulus * contact**3 / (3 * radius) - 2 * np.pi * radius * work, contact
 
 
-def _maugis(depth: Array, logs: Array, radius: float) -> Array:
+def _maugis(depth: Array, logs: Array, radius: float) -> tuple[Array, Array]:
     work, modulus, strength = (float(value) for value in np.exp(logs[:3]))
     deepest = max(float(depth.max()), 1e-9)
     contact = 1.5 * math.sqrt(deepest * radius) + 3.0 * (radius**2 * work / modulus) ** (1 / 3)
     curve = jkr.maugis_curve(work, radius, modulus, strength, largest_contact=contact, points=400)
-    return np.asarray(np.interp(depth, curve.indentation[::-1], curve.force[::-1]), dtype=np.float64)
+    rising = curve.indentation[::-1]
+    return np.interp(depth, rising, curve.force[::-1]), np.interp(depth, rising, curve.contact_radius[::-1])
 
 
-LAWS: dict[str, Callable[[Array, Array, float], Array]] = {"JKR": _jkr, "DMT": _dmt, "Maugis": _maugis}
-"""Force at a depth for the logarithms of w, E* (and strength); beyond the last stable contact its force is kept."""
+LAWS: dict[str, Callable[[Array, Array, float], tuple[Array, Array]]] = {"JKR": _jkr, "DMT": _dmt, "Maugis": _maugis}
+"""Force and contact radius at a depth for the logarithms of w, E* (and strength), while the line recedes.
+
+Beyond the last stable contact its force is kept.
+"""
+
+
+def _force(model: str, depth: Array, corner: float, logs: Array, radius: float) -> Array:
+    """Force at a depth where the line is pinned at depths beyond ``corner``."""
+    force, contact = LAWS[model](np.minimum(depth, corner), logs, radius)
+    return force + 2 * math.exp(logs[1]) * contact * np.maximum(depth - corner, 0.0)
 
 
 def _fit(model: str, place: Array, pull: Array, radius: float) -> ContactFit:
     work, modulus, origin = _first_guess(place, pull, radius)
-    jkr_start = np.array([math.log(work), math.log(modulus), origin / 1e-6])
-    first = _solve("JKR", place, pull, radius, jkr_start)
+    first = _cornered("JKR", place, pull, radius, [math.log(work), math.log(modulus)], origin)
     if model == "JKR":
         return first
     logs = [math.log(first.work_of_adhesion), math.log(first.modulus)]
     if model == "DMT":
-        return _solve("DMT", place, pull, radius, np.array([*logs, first.origin / 1e-6]))
+        return _cornered("DMT", place, pull, radius, logs, first.origin)
     length = (math.pi * first.work_of_adhesion * (4 / 3 * first.modulus) ** 2 / radius) ** (1 / 3)
-    starts = (np.array([*logs, math.log(cohesion * length / 2), first.origin / 1e-6]) for cohesion in (0.3, 1.0, 4.0))
-    return min((_solve("Maugis", place, pull, radius, start) for start in starts), key=lambda fit: fit.misfit)
+    starts = ([*logs, math.log(cohesion * length / 2)] for cohesion in (0.3, 1.0, 4.0))
+    return min(
+        (_solve("Maugis", place, pull, radius, start, first.corner, first.origin) for start in starts),
+        key=lambda fit: fit.misfit,
+    )
 
 
-def _solve(model: str, place: Array, pull: Array, radius: float, start: Array) -> ContactFit:
-    """Least squares over the logarithms of w, E* (and strength) and the origin in micrometres."""
+def _cornered(model: str, place: Array, pull: Array, radius: float, logs: list[float], origin: float) -> ContactFit:
+    """Fit from a line that recedes from the start, then from one that is pinned at first; keep the better."""
+    free = _solve(model, place, pull, radius, logs, float(place.min()), origin)
+    logs = [math.log(free.work_of_adhesion), math.log(free.modulus)]
+    pinned = _solve(model, place, pull, radius, logs, float(np.median(place)), free.origin)
+    return min((free, pinned), key=lambda fit: fit.misfit)
+
+
+def _solve(
+    model: str, place: Array, pull: Array, radius: float, logs: list[float], corner: float, origin: float
+) -> ContactFit:
+    """Least squares over the logarithms of w, E* (and strength), and corner and origin in micrometres.
+
+    The line begins to recede somewhere between the deepest point and that of the largest tension.
+    """
     from scipy.optimize import least_squares
 
-    law = LAWS[model]
     scale = float(np.ptp(pull))
+    first, last = float(place.min()), float(place[int(np.argmin(pull))])
 
     def residual(unknown: Array) -> Array:
-        return (law(unknown[-1] * 1e-6 - place, unknown[:-1], radius) - pull) / scale
+        corner, origin = (float(value) * 1e-6 for value in unknown[-2:])
+        return (_force(model, origin - place, origin - corner, unknown[:-2], radius) - pull) / scale
 
-    solution = least_squares(residual, start, max_nfev=200, x_scale="jac")
+    start = np.array([*logs, min(corner, last) / 1e-6, origin / 1e-6])
+    lowest = np.array([*(log - WIDEST for log in logs), first / 1e-6 - 1e-3, -np.inf])
+    highest = np.array([*(log + WIDEST for log in logs), last / 1e-6 + 1e-3, np.inf])
+    solution = least_squares(residual, start, bounds=(lowest, highest), max_nfev=200, x_scale="jac")
     jacobian = np.asarray(solution.jac, dtype=np.float64)
     variance = float(np.sum(solution.fun**2)) / max(1, place.size - start.size)
     spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
-    logs = solution.x
+    found = solution.x
     return ContactFit(
         model=model,
-        work_of_adhesion=math.exp(logs[0]),
-        work_of_adhesion_uncertainty=math.exp(logs[0]) * float(spread[0]),
-        modulus=math.exp(logs[1]),
-        modulus_uncertainty=math.exp(logs[1]) * float(spread[1]),
-        origin=float(logs[-1]) * 1e-6,
-        strength=math.exp(logs[2]) if model == "Maugis" else math.nan,
+        work_of_adhesion=math.exp(found[0]),
+        work_of_adhesion_uncertainty=math.exp(found[0]) * float(spread[0]),
+        modulus=math.exp(found[1]),
+        modulus_uncertainty=math.exp(found[1]) * float(spread[1]),
+        origin=float(found[-1]) * 1e-6,
+        corner=float(found[-2]) * 1e-6,
+        strength=math.exp(found[2]) if model == "Maugis" else math.nan,
         misfit=float(np.sqrt(np.mean(solution.fun**2))) * scale,
         separation=place,
-        force=np.asarray(residual(logs) * scale + pull, dtype=np.float64),
+        force=np.asarray(solution.fun * scale + pull, dtype=np.float64),
     )
 
 
@@ -239,33 +283,31 @@ def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float
 def contact_models(work: Extraction) -> Details:
     """Fit JKR and DMT to the attached part of the retraction, F against z, and keep the better.
 
-    A contact line that is pinned at first (hysteresis) fits neither: the uncertainty holds how far the same model moves
-    when it is fitted to the tension alone, and the spread between the two models.
+    At first the contact line is pinned (hysteresis), and the contact as stiff as a punch; where it begins to recede is
+    fitted too. The uncertainty holds how far the same model moves when it is fitted to the tension alone, or with a
+    compliance one standard uncertainty larger, and the spread between the models, the less the worse the other fits.
 
     Maugis has one parameter more and is fitted on request only (``fit_contact``): it follows noise where the others
     suffice.
     """
     start, _ = work.retraction()
-    part = slice(start, int(work.release))
+    part, tense = slice(start, int(work.release)), slice(max(start, int(work.zero)), int(work.release))
     radius = indenter_radius(work.run)
-    fits = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
-    tense = slice(max(start, int(work.zero)), int(work.release))
-    other = fit_contact(work.separation[tense], work.force[tense], radius, models=(fits[0].model,))[0]
-    best, gain = fits[0], work.run.sensors.force_gain
-    work.set(fitted_work_of_adhesion_J_m2=best.work_of_adhesion, fitted_modulus_Pa=best.modulus)
-    work.stated["fitted_work_of_adhesion_J_m2"] = math.hypot(
-        best.work_of_adhesion_uncertainty,
-        gain * best.work_of_adhesion,
-        best.work_of_adhesion - other.work_of_adhesion,
-        (best.work_of_adhesion - fits[1].work_of_adhesion) / 12**0.5,
-    )
-    work.stated["fitted_modulus_Pa"] = math.hypot(
-        best.modulus_uncertainty,
-        gain * best.modulus,
-        best.modulus - other.modulus,
-        (best.modulus - fits[1].modulus) / 12**0.5,
-    )
+    best, rival = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
+    stretched = work.separation[part] + work.run.sensors.compliance_uncertainty * work.force[part]
+    others = [
+        fit_contact(separation, force, radius, models=(best.model,))[0]
+        for separation, force in ((work.separation[tense], work.force[tense]), (stretched, work.force[part]))
+    ]
+    plausible = best.misfit / rival.misfit / 12**0.5
+    for name, key in (("fitted_work_of_adhesion_J_m2", "work_of_adhesion"), ("fitted_modulus_Pa", "modulus")):
+        value = float(getattr(best, key))
+        spread = [value - float(getattr(other, key)) for other in others]
+        spread += [plausible * (value - float(getattr(rival, key))), work.run.sensors.force_gain * value]
+        work.set(**{name: value})
+        work.stated[name] = math.hypot(float(getattr(best, f"{key}_uncertainty")), *spread)
     words = "; ".join(
-        f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in fits
+        f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in (best, rival)
     )
-    return {"decision": words, "fits": fits}
+    pinned = (best.corner - float(best.separation[0])) * 1e6
+    return {"decision": f"{words}; the line recedes after {max(pinned, 0.0):.0f} um", "fits": (best, rival)}

@@ -114,8 +114,9 @@ def detachment(work: Extraction) -> Details:
 
     1. The contact is lost after the last sample of the jump that still stands out of the force after it.
     2. The separation is the stage's height half a sample later, less the load train's stretch, compliance times force:
-       the train springs back only when the contact is lost. Contacts run away before that: within the sample that is
-       not seen the force is taken to fall by twice as much as in the one before, and by that much uncertain.
+       the train springs back only when the contact is lost. Contacts run away before that, within the sample that is
+       not seen: the force is taken to fall by twice as much as in the one before, and what is left then counts the
+       less, the more the fall has grown from sample to sample. It can be anything from there to the last force seen.
     3. Without such a jump: where the tension falls below four standard deviations of a 20 ms mean.
     """
     start, _ = work.retraction()
@@ -130,9 +131,8 @@ def detachment(work: Extraction) -> Details:
         jump = releases[-1]
         last = _last_tense(work, jump)
         work.release = last + 0.5
-        fall = float(work.force[last] - work.force[last - 1])
-        held = min(float(work.force[last]) + 2 * fall, 0.0)
-        work.recoil = work.run.sensors.compliance * abs(held - float(work.force[last]))
+        held = _held(work.force[last - 2 : last + 1])
+        work.recoil = work.run.sensors.compliance * abs(held - float(work.force[last])) / 3**0.5
         work.set(snap_force_N=-jump.before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
         decision = f"jump of {jump.size * 1e3:.1f} mN within {(jump.stop - jump.start) / work.run.rate * 1e3:.3g} ms"
     else:
@@ -144,6 +144,13 @@ def detachment(work: Extraction) -> Details:
     work.release_separation = work.at(work.run.height, work.release) + work.run.sensors.compliance * held
     work.set(pull_off_distance_m=work.release_separation - work.zero_separation)
     return {"decision": decision, "index": work.release}
+
+
+def _held(last: Array) -> float:
+    """Return the tension at the end of the contact, N, negative, from the last three samples before it."""
+    before, fall = np.diff(last).tolist()
+    growth = float(np.clip((fall - before) / fall, 0.0, 1.0)) if fall > 0 else 0.0
+    return min(float(last[-1]) + 2 * fall, 0.0) * (1 - growth)
 
 
 def _last_tense(work: Extraction, jump: ForceJump) -> int:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import random
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from test_kill_recording import LIFE, WRITER, check, killed
+from killed_run import LIFE, record_and_kill, record_whole
+from test_kill_recording import check
 
 from rig.errors import RigError
 from rig.recording import load_recording
@@ -26,12 +26,12 @@ def main() -> None:
     found: list[bool] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "whole.h5"
-        subprocess.run([sys.executable, str(WRITER), str(path), "max"], check=True, stdout=subprocess.DEVNULL)
+        record_whole(path)
         whole = load_recording(path)
         acknowledged_in_all = 0
         for trial in range(arguments.trials):
             path = Path(folder) / "killed.h5"
-            acknowledged, _ = killed(path, draw.uniform(0, LIFE))
+            acknowledged = record_and_kill(path, draw.uniform(0, LIFE))[-1].samples
             acknowledged_in_all += acknowledged
             try:
                 check(path, acknowledged, whole)
@@ -47,7 +47,7 @@ def main() -> None:
         ages = []
         for trial in range(arguments.real_time):
             path = Path(folder) / f"real-{trial}.h5"
-            ages.append(killed(path, draw.uniform(5, 10), "1")[1])
+            ages.append(max(told.age for told in record_and_kill(path, draw.uniform(5, 10), "1")))
     print(f"{len(found)} kills, {sum(found)} files whole and true, {acknowledged_in_all} samples acknowledged")
     print("longest wait for the acknowledgement in real time, ms:", " ".join(f"{age * 1e3:.0f}" for age in ages))
 

@@ -14,7 +14,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from test_kill_recording import WRITER
+from killed_run import record_and_kill
 from test_power_cut import is_part_of
 
 from rig.errors import RigError
@@ -66,20 +65,13 @@ def record(folder: Path, seconds: float, *options: str) -> tuple[list[Entry], np
     server.stdout.readline()
     run("mke2fs", "-q", "-F", "-t", "ext4", disk)
     with mounted(disk, place):
-        command = [sys.executable, str(WRITER), str(place / "run.h5"), *options]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
-            assert writer.stdout is not None
-            told = [writer.stdout.readline()]
-            time.sleep(seconds)
-            writer.kill()
-            told += writer.stdout.readlines()
+        told = record_and_kill(place / "run.h5", seconds, *options)
         for name in ("run.h5", "run.h5.journal"):
             if (place / name).exists():
                 shutil.copy(place / name, whole.with_name(name.replace("run", "whole")))
     run("umount", disk)
     server.wait()
-    rows = [line.split() for line in told if line.endswith("\n")]
-    acknowledged = np.array([(float(moment), int(samples)) for samples, _, moment in rows])
+    acknowledged = np.array([(one.moment, one.samples) for one in told])
     return pickle.loads(log.read_bytes()), acknowledged, whole  # noqa: S301 - written just now
 
 

@@ -117,8 +117,8 @@ def jkr_curve(
     return ContactCurve(indentation, force, contact)
 
 
-def jkr_force(indentation: ArrayLike, work_of_adhesion: float, radius: float, modulus: float) -> Array:
-    """Return the exact JKR force at given indentations, N; nan where no contact is stable.
+def jkr_contact_radius(indentation: ArrayLike, work_of_adhesion: float, radius: float, modulus: float) -> Array:
+    """Return the exact JKR contact radius at given indentations, m; nan where no contact is stable.
 
     Solves a^2 / R - 2 sqrt(pi w a / (2 E*)) = indentation for its larger root by Newton's method; the left side is
     convex and rising there, so that the iteration from above cannot miss.
@@ -137,8 +137,14 @@ def jkr_force(indentation: ArrayLike, work_of_adhesion: float, radius: float, mo
         root = np.maximum(root - step, root_fold)
         if np.all(np.abs(step) <= 1e-15 * root):
             break
-    force = 4 * modulus * (root**6 / (3 * radius) - math.sqrt(pull) * root**3)
-    return np.where(alive, force, np.nan)
+    return np.where(alive, root**2, np.nan)
+
+
+def jkr_force(indentation: ArrayLike, work_of_adhesion: float, radius: float, modulus: float) -> Array:
+    """Return the exact JKR force at given indentations, N; nan where no contact is stable."""
+    contact = jkr_contact_radius(indentation, work_of_adhesion, radius, modulus)
+    pull = math.pi * work_of_adhesion / (2 * modulus)
+    return np.asarray(4 * modulus * (contact**3 / (3 * radius) - np.sqrt(pull * contact**3)), dtype=float)
 
 
 def dmt_curve(

@@ -145,13 +145,14 @@ class Recorder:
         """Take one frame; it is acknowledged with the next flush."""
         self._frames.append((frame, height, arrived))
         if time.perf_counter() - self._last_flush >= FLUSH_SECONDS:
-            self.flush()
-            self._insist_on_disk()
+            self._commit()
 
     def step(self, event: StepEvent) -> None:
-        """Take the beginning or the end of a step."""
+        """Take the beginning or the end of a step; what a step has done is on the disk before the next begins."""
         if event.phase is not StepPhase.PROGRESS:
             self._put("steps", _row(STEPS, event.sample, event.phase.value, event.name, event.outcome))
+        if event.phase is StepPhase.ENDED and event.outcome == "done":
+            self._commit()
 
     def event(self, event: Event) -> None:
         """Take one line of the log."""
@@ -236,6 +237,10 @@ class Recorder:
                 self._journal.close(keep=False)
         finally:
             os.close(self._held)
+
+    def _commit(self) -> None:
+        self.flush()
+        self._insist_on_disk()
 
     def _insist_on_disk(self) -> None:
         """End the run in good order before the disk is full, or when the file has gone from its place."""

@@ -20,8 +20,10 @@ import h5py
 import numpy as np
 from conftest import scene_text
 from google.protobuf.message import DecodeError
+from test_pump import CALLS as PUMP_CALLS
 from test_pump import GOOD_START as PUMP_START
 from test_pump import babble as pump_that_hears
+from test_stage import CALLS as STAGE_CALLS
 from test_stage import GOOD_START as STAGE_START
 from test_stage import connect as stage_that_hears
 
@@ -107,24 +109,6 @@ def fault_file(data: bytes) -> None:
         load_faults(path)
     except FileError as error:
         one_message(error)
-
-
-STAGE_CALLS: tuple[Callable[[PIStage], Any], ...] = (
-    PIStage.status,
-    PIStage.stop,
-    PIStage.emergency_stop,
-    PIStage.reference,
-    lambda stage: stage.referenced,
-    lambda stage: stage.servo(True),
-    lambda stage: stage.move_to(0.01),
-    lambda stage: stage.set_speed(1e-3),
-)
-PUMP_CALLS: tuple[Callable[[LegatoPump], Any], ...] = (
-    LegatoPump.status,
-    LegatoPump.stop,
-    lambda pump: pump.dispense(100e-9, 100e-9),
-    lambda pump: pump.dispense(-100e-9, 100e-9),
-)
 
 
 def gcs_replies(data: bytes) -> None:

@@ -91,6 +91,22 @@ def test_each_contact_model_is_recovered_from_its_own_curve(truth: str) -> None:
     assert fits[truth].misfit <= 1.1 * min(fit.misfit for fit in fits.values())
 
 
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_a_line_that_is_pinned_at_first_does_not_stiffen_the_modulus(share: float) -> None:
+    curve = jkr.jkr_curve(WORK, RADIUS, MODULUS, largest_contact=0.7e-3, points=2000)
+    depth = np.linspace(curve.indentation[0], curve.indentation[-1], 2000)
+    corner = depth[0] - share * (depth[0] - depth[int(np.argmin(np.interp(-depth, -curve.indentation, curve.force)))])
+    contact = float(jkr.jkr_contact_radius(corner, WORK, RADIUS, MODULUS))
+    force = jkr.jkr_force(np.minimum(depth, corner), WORK, RADIUS, MODULUS)
+    force += 2 * MODULUS * contact * np.maximum(depth - corner, 0.0)
+    noise = np.random.default_rng(0).normal(0, 2e-4, depth.size)
+    best = fit_contact(-depth, force + noise, RADIUS, models=("JKR", "DMT"))[0]
+    assert best.model == "JKR"
+    assert best.modulus == pytest.approx(MODULUS, rel=0.01)
+    assert best.work_of_adhesion == pytest.approx(WORK, rel=0.01)
+    assert best.corner == pytest.approx(-corner, abs=2e-6)
+
+
 def test_fit_refuses_a_curve_without_tension() -> None:
     with pytest.raises(FeatureMissing, match="no tension"):
         fit_contact(np.linspace(-1e-4, 0, 500), np.linspace(0.1, 0.01, 500), RADIUS)

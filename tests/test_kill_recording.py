@@ -3,41 +3,21 @@
 from __future__ import annotations
 
 import random
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from killed_run import LIFE, record_and_kill, record_whole
 
 from rig.recording import load_recording
-
-WRITER = Path(__file__).with_name("killed_writer.py")
-LIFE = 1.6
-"""Seconds, from the first acknowledged sample, in which the kill may come."""
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The same run, undisturbed: one seed is one run."""
     path = tmp_path_factory.mktemp("whole") / "whole.h5"
-    subprocess.run([sys.executable, str(WRITER), str(path), "max"], check=True, stdout=subprocess.DEVNULL)
+    record_whole(path)
     return load_recording(path)
-
-
-def killed(path: Path, seconds: float, speed: str = "max", *options: str) -> tuple[int, float]:
-    """Kill a writer so long after its first word; return the samples acknowledged and the longest any had waited, s."""
-    command = [sys.executable, str(WRITER), str(path), speed, *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
-        assert writer.stdout is not None
-        told = [writer.stdout.readline()]
-        time.sleep(seconds)
-        writer.kill()
-        told += writer.stdout.readlines()
-    rows = [line.split() for line in told if line.endswith("\n")]
-    return int(rows[-1][0]), max(float(age) for _, age, _ in rows)
 
 
 def check(path: Path, acknowledged: int, whole) -> None:
@@ -59,8 +39,8 @@ def check(path: Path, acknowledged: int, whole) -> None:
 @pytest.mark.parametrize("options", [("plain",), ("journalled",)])
 def test_a_killed_run_keeps_what_it_acknowledged(options, tmp_path, whole):
     path = tmp_path / "killed.h5"
-    acknowledged, _ = killed(path, random.Random(1).uniform(0, 0.6), "max", *options)
-    check(path, acknowledged, whole)
+    told = record_and_kill(path, random.Random(1).uniform(0, 0.6), "max", *options)
+    check(path, told[-1].samples, whole)
 
 
 @pytest.mark.soak
@@ -68,5 +48,5 @@ def test_a_killed_run_keeps_what_it_acknowledged(options, tmp_path, whole):
 @pytest.mark.parametrize("trial", range(200))
 def test_two_hundred_kills_lose_nothing(trial, tmp_path, whole):
     path = tmp_path / "killed.h5"
-    acknowledged, _ = killed(path, random.Random(trial).uniform(0, LIFE))
-    check(path, acknowledged, whole)
+    told = record_and_kill(path, random.Random(trial).uniform(0, LIFE))
+    check(path, told[-1].samples, whole)

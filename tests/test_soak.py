@@ -55,10 +55,11 @@ def random_run(number: int, folder, *, wire: bool) -> None:
 def soak(runs: int, folder, *, wire: bool) -> dict[str, tuple[float, float]]:
     """Run so many; return memory (MB), threads and open files after the warm-up and at the end."""
     process = psutil.Process()
+    open_files = process.num_handles if psutil.WINDOWS else process.num_fds
 
     def usage() -> tuple[float, float, float]:
         gc.collect()
-        return process.memory_info().rss / 1e6, threading.active_count(), process.num_fds()
+        return process.memory_info().rss / 1e6, threading.active_count(), open_files()
 
     before = usage()
     for number in range(runs):
