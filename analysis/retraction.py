@@ -150,7 +150,7 @@ def _held(last: Array) -> float:
     """Return the tension at the end of the contact, N, negative, from the last three samples before it."""
     before, fall = np.diff(last).tolist()
     growth = float(np.clip((fall - before) / fall, 0.0, 1.0)) if fall > 0 else 0.0
-    return min(float(last[-1]) + 2 * fall, 0.0) * (1 - growth)
+    return float(min(last[-1] + 2 * fall, 0.0) * (1 - growth))
 
 
 def _last_tense(work: Extraction, jump: ForceJump) -> int:

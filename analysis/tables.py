@@ -111,7 +111,6 @@ def _column(groups: Sequence[Group], reference: Quantity) -> tuple[str, ...]:
     low, high = _mean(least, "pull_off_force_N"), _mean(largest, "pull_off_force_N")
     pressures = [_mean(m, "initial_pressure_Pa") for m in groups if m.pooled("initial_pressure_Pa")]
     pressures.sort(key=lambda pressure: pressure.value)
-    ratio = enhancement_ratio(high, low)
     area = _area(least)
     counts = ", ".join(str(len(members.kept)) for members in (least, largest))
     head = (
@@ -120,7 +119,7 @@ def _column(groups: Sequence[Group], reference: Quantity) -> tuple[str, ...]:
         _text(pressures[0], 1e-3) if pressures else NOT_AVAILABLE,
         _text(low),
         _text(high),
-        _text(ratio),
+        NOT_AVAILABLE if least is largest else _text(enhancement_ratio(high, low)),
     )
     if area is None:
         return (*head, *[NOT_AVAILABLE] * 4, counts)

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.cone_branch import Branch, Point, settled_state
-from model.cone_error import of_features
+from model.cone_error import of_energy, of_features
 from model.cone_path import Path, strongest_pull, trace, zero_of_force
 from model.cone_terms import Cone, Driven, Gas, Isothermal, Number, Vented
 from model.parameters import GasAnchor, Parameters
@@ -104,6 +105,8 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
     detachment = path.detachment
     length, force = scales.length, scales.force
     errors = of_features(branch, zero, peak, detachment)
+    energy, energy_error = adhesion_energy(branch, path, zero, profile)
+    units = {"pull_off_force": force, "adhesion_energy": scales.energy}
     return Prediction(
         name,
         Outcome.PULL_OFF,
@@ -115,7 +118,7 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         onset_position=path.onset.position * length,
         detachment_position=detachment.position * length,
         detachment_radius=detachment.radius * length,
-        adhesion_energy=adhesion_energy(branch, path, zero, profile) * scales.energy,
+        adhesion_energy=energy * scales.energy,
         position=profile.position * length,
         retraction=(profile.position - zero.position) * length,
         force=profile.force * force,
@@ -124,7 +127,8 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         stable=np.ones(len(profile.radius), dtype=bool),
         jumps=tuple(_jumps(path, scales)),
         numerical_error={
-            name: error * (force if name == "pull_off_force" else length) for name, error in errors.items()
+            name: error * units.get(name, length)
+            for name, error in (errors | {"adhesion_energy": energy_error}).items()
         },
         runtime_s=time.perf_counter() - begin,
         evaluations=cone.evaluations,
@@ -206,18 +210,31 @@ def start_growth(cone: Cone) -> Number:
     return (cone.start_position + edge.drop) * (1 + radius + radius**2) - edge.cap
 
 
-def adhesion_energy(branch: Branch, path: Path, zero: Point, profile: Profile) -> float:
-    """Return the work of the force from its zero to detachment: differences of the potential between the jumps."""
+def adhesion_energy(branch: Branch, path: Path, zero: Point, profile: Profile) -> tuple[float, float]:
+    """Return the work of the force from its zero to detachment, and its error.
+
+    It is the sum of the potential's differences between the jumps; where the pressure was measured there is no
+    potential, and the force is integrated by trapezoids, whose error is told by those of twice the width.
+    """
     if isinstance(branch.cone.gas, Driven):
-        after = profile.position >= zero.position
-        return float(-np.trapezoid(profile.force[after], profile.position[after]))
+        after = np.flatnonzero(profile.position >= zero.position)
+        work, coarse = (
+            float(-np.trapezoid(profile.force[kept], profile.position[kept]))
+            for kept in (after, np.union1d(after[::2], after[-1:]))
+        )
+        return work, abs(work - coarse)
+    pieces = list(_tense_pieces(path, zero))
+    work = sum(_potential(branch.cone, last) - _potential(branch.cone, begin) for begin, last in pieces)
+    return work, of_energy(branch, [point for piece in pieces for point in piece])
+
+
+def _tense_pieces(path: Path, zero: Point) -> Iterator[tuple[Point, Point]]:
+    """Yield where each stretch between two jumps begins and ends, from the zero of force on."""
     pieces = [(path.pinned.first, path.pinned.last), *((stretch.first, stretch.last) for stretch in path.stretches)]
-    work = 0.0
     for first, last in pieces:
         begin = zero if first.position < zero.position <= last.position else first
         if begin.position >= zero.position and begin.position < last.position:
-            work += _potential(branch.cone, last) - _potential(branch.cone, begin)
-    return work
+            yield begin, last
 
 
 def _potential(cone: Cone, point: Point) -> float:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from model.cone_branch import Branch, Point, tilt_of
-from model.cone_terms import Cone, Driven, Edge, Isothermal, Number, stretch_energy
+from model.cone_terms import Cone, Driven, Edge, Isothermal, Number, contact_energy, stretch_energy
 from model.prediction import Array
 from model.roots import EPSILON
 
@@ -83,6 +83,24 @@ def of_features(branch: Branch, zero: Point, peak: Point, detachment: Point) -> 
         "detachment_position": at_end.position,
         "detachment_radius": _radius_at_fold(branch, detachment),
     }
+
+
+def of_energy(branch: Branch, ends: list[Point]) -> float:
+    """Return the error of a sum of differences of the potential between these points, dimensionless."""
+    return sum(_error_of_potential(branch, point) for point in ends)
+
+
+def _error_of_potential(branch: Branch, point: Point) -> float:
+    cone = branch.cone
+    edge = cone.edge(point.radius)
+    terms = (1 + point.radius) * edge.gap * stretch_energy(point.t)[0] + cone.adhesion * point.radius**2
+    if cone.sphere is not None and cone.contact_stretch and point.radius > 0:
+        terms += contact_energy(point.radius, cone.sphere)
+    gas = cone.gas
+    level = abs(gas.initial) + gas.atmosphere if isinstance(gas, Isothermal) else pressure_terms(cone, edge, point.t)
+    terms += level * (edge.gap * edge.area * abs(point.t) + edge.cap)
+    moved = abs(cone.state(edge, point.t).force) * _anywhere(branch, point).position
+    return float(SAFETY * EPSILON * terms + moved)
 
 
 def _anywhere(branch: Branch, point: Point) -> Uncertainty:

@@ -246,8 +246,7 @@ class Cone:
         radius = edge.radius
         energy = (1 + radius) * edge.gap * stretch_energy(t)[0] - self.adhesion * radius**2 / 2
         if self.sphere is not None and self.contact_stretch and radius > 0:
-            excess = arc_excess(radius / self.sphere)
-            energy += (radius * excess * (2 + excess) / (1 + excess)) ** 2
+            energy += contact_energy(radius, self.sphere)
         if isinstance(self.gas, Isothermal):
             return float(energy + self.gas.potential(self.growth(edge, t)))
         if isinstance(self.gas, Vented) and self.gas.initial != 0:
@@ -297,6 +296,12 @@ def _contact_stretch(u: Number, cosine: Number, excess: Number) -> tuple[Number,
         2 * strain_rate * q + strain_rate * q_rate - 2 * q**2 / stretch**3
     )
     return value, value + rate
+
+
+def contact_energy(radius: float, sphere: float) -> float:
+    """Return W_2 (EML Eq. 4), dimensionless."""
+    excess = arc_excess(radius / sphere)
+    return (radius * excess * (2 + excess) / (1 + excess)) ** 2
 
 
 def arc_excess(u: float) -> float:

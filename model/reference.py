@@ -33,6 +33,8 @@ class Reference:
     zero_force_position: Any
     detachment_position: Any
     detachment_radius: Any
+    adhesion_energy: Any
+    """nan where the contact has jumped."""
     jumps: int
     digits: int
 
@@ -209,7 +211,7 @@ class _Polish:
     def reference(self) -> Reference:
         onset = self.onset()
         jumps, detachment = self.detachment(onset)
-        zero = self.zero(onset)
+        zero_radius, zero = self.zero(onset)
         peak_force, peak_z = self.peak(onset, detachment)
         return Reference(
             pull_off_force=-peak_force,
@@ -218,9 +220,15 @@ class _Polish:
             zero_force_position=zero,
             detachment_position=detachment[1],
             detachment_radius=detachment[0],
+            adhesion_energy=mpmath.nan if jumps else self.work((zero_radius, zero), detachment),
             jumps=jumps,
             digits=self.digits,
         )
+
+    def work(self, first: tuple[Any, Any], last: tuple[Any, Any]) -> Any:
+        """Return the work between two equilibria on one smooth path: nothing but the potential's difference."""
+        least = self.r_i * mpmath.mpf(10) ** -self.digits
+        return self.energy(max(last[0], least), last[1]) - self.energy(*first)
 
     def force(self, r: Any, z: Any) -> Any:
         return -self.derivative(r, z, 0, 1)
@@ -307,12 +315,12 @@ class _Polish:
                 return r, z
         raise NotConverged(f"reference: Newton's method did not settle near r = {float(r):g} m, z = {float(z):g} m")
 
-    def zero(self, onset: Any) -> Any:
-        """Return z where the force first turns tensile."""
+    def zero(self, onset: Any) -> tuple[Any, Any]:
+        """Return (r, z) where the force first turns tensile."""
         if self.force(self.r_i, self.z_0) <= 0:
-            return self.z_0
+            return self.r_i, self.z_0
         if self.force(self.r_i, onset) < 0:
-            return self.root(lambda z: self.force(self.r_i, z), self.z_0, onset)
+            return self.r_i, self.root(lambda z: self.force(self.r_i, z), self.z_0, onset)
         tensile = np.flatnonzero(self.march.force(self.r, self.z) < 0)
         if not tensile.size:
             raise NotConverged("reference: the force never becomes tensile")
@@ -333,7 +341,8 @@ class _Polish:
                 break
             margin *= 1.5
             low, high = mpmath.mpf(r_low - margin), min(self.r_i, mpmath.mpf(r_high + margin))
-        return forceless(self.root(residual, low, high, 24))
+        radius = self.root(residual, low, high, 24)
+        return radius, forceless(radius)
 
     def peak(self, onset: Any, detachment: tuple[Any, Any]) -> tuple[Any, Any]:
         """Return the most tensile force and its z."""

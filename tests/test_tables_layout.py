@@ -84,7 +84,7 @@ def test_cells_carry_their_uncertainty() -> None:
     table = characterization(group([analyze(run_of(0.52, parameters=parameters))]))
     assert "±" in cell(table, "Max. Pull-off", "Flat Glass")
     assert "±" in cell(table, "Max. Adhesion Efficiency", "Flat Glass")
-    assert cell(table, "Enhancing", "Flat Glass").startswith("1.000")
+    assert cell(table, "Enhancing", "Flat Glass") == "N/A"  # one pressure has no ratio
 
 
 def test_table_s2_is_the_soft_gripper() -> None:

@@ -50,6 +50,10 @@ def overview_bytes(run: Run, analysis: Analysis, prediction: Prediction | None, 
         return encode(figure, kind)
 
 
+ANCHORED = {"free": ", $P_0$ at $V_0$", "start": ", $P_0$ at $z_0$", "vented": ", vented", "measured": ", as measured"}
+"""What the gas law of a prediction starts from; in contact the chamber is smaller than V_0 (EML Eq. 6)."""
+
+
 def draw_overview(figure: Figure, run: Run, analysis: Analysis, prediction: Prediction | None) -> None:
     """Draw both panels into a figure: force and pressure of a test, the fit of a test of the chamber alone."""
     from analysis.figures.fit_picture import chamber_picture, draw_fit
@@ -152,7 +156,7 @@ def _against_retraction(axes: Axes, run: Run, analysis: Analysis, prediction: Pr
         force = np.append(prediction.force[stable], 0.0)
         lines += axes.plot(np.append(place, place[-1]), force, "--", color=BLACK, linewidth=1.2, label=label)
         if twin is not None:
-            label = rf"$P_a$ model ({prediction.model})"
+            label = f"$P_a$ model{ANCHORED.get(prediction.assumptions.get('gas anchor', ''), '')}"
             lines += twin.plot(place, prediction.pressure[stable] * 1e-3, ":", color=BLACK, linewidth=1.4, label=label)
     _limits(axes, analysis, prediction)
     _annotate(axes, analysis)
