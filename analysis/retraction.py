@@ -114,9 +114,9 @@ def detachment(work: Extraction) -> Details:
 
     1. The contact is lost after the last sample of the jump that still stands out of the force after it.
     2. The separation is the stage's height half a sample later, less the load train's stretch, compliance times force:
-       the train springs back only when the contact is lost. Contacts run away before that, within the sample that is
-       not seen: the force is taken to fall by twice as much as in the one before, and what is left then counts the
-       less, the more the fall has grown from sample to sample. It can be anything from there to the last force seen.
+       the train springs back only when the contact is lost. Contacts run away before that: within the sample that is
+       not seen the force is taken to fall by twice as much as in the one before, and by that much uncertain. A JKR
+       contact loses its force with its area: there half of what would be left counts, uncertain from that to nothing.
     3. Without such a jump: where the tension falls below four standard deviations of a 20 ms mean.
     """
     start, _ = work.retraction()
@@ -131,8 +131,8 @@ def detachment(work: Extraction) -> Details:
         jump = releases[-1]
         last = _last_tense(work, jump)
         work.release = last + 0.5
-        held = _held(work.force[last - 2 : last + 1])
-        work.recoil = work.run.sensors.compliance * abs(held - float(work.force[last])) / 3**0.5
+        held, uncertain = _held(work, last)
+        work.recoil = work.run.sensors.compliance * uncertain
         work.set(snap_force_N=-jump.before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
         decision = f"jump of {jump.size * 1e3:.1f} mN within {(jump.stop - jump.start) / work.run.rate * 1e3:.3g} ms"
     else:
@@ -146,11 +146,13 @@ def detachment(work: Extraction) -> Details:
     return {"decision": decision, "index": work.release}
 
 
-def _held(last: Array) -> float:
-    """Return the tension at the end of the contact, N, negative, from the last three samples before it."""
-    before, fall = np.diff(last).tolist()
-    growth = float(np.clip((fall - before) / fall, 0.0, 1.0)) if fall > 0 else 0.0
-    return float(min(last[-1] + 2 * fall, 0.0) * (1 - growth))
+def _held(work: Extraction, last: int) -> tuple[float, float]:
+    """Return the force at the end of the contact, after the last sample in tension, and its standard uncertainty, N."""
+    seen, fall = float(work.force[last]), float(work.force[last] - work.force[last - 1])
+    left = min(seen + 2 * fall, 0.0)
+    if work.run.protocol == "indentation":
+        return left / 2, abs(seen) / 2 / 6**0.5  # triangular, between the last force seen and none
+    return left, abs(left - seen) / 3**0.5  # rectangular
 
 
 def _last_tense(work: Extraction, jump: ForceJump) -> int:

@@ -94,9 +94,11 @@ def recover(path: Path, *, force: bool = False) -> Recovery:
         The file cannot be read at all, or the program that writes it is still running (``force`` overrides).
     """
     _insist(path)
-    rewritten = None if is_sealed(path) else _rewritten(path, force=force)
-    if rewritten is not None:
-        return rewritten
+    if not is_sealed(path):
+        rewritten = _rewritten(path, force=force)
+        if rewritten is not None:
+            return rewritten
+        probe(path)
     with _opened(path) as file:
         if file.swmr_mode and not force and _writer_lives(file):
             raise FileError(f"recording {path}: is still being written. Remedy: wait for the run to end.")
