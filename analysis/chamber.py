@@ -47,8 +47,9 @@ def fit_boyle(
     pressure
         (n,), Pa gauge.
     interval
-        Time between the points, s. Given, a leak proportional to P_a is fitted beside V_0: what has left by then is
-        the integral of P_a over its time constant, times V_0.
+        Time between the points, s. Given, a leak proportional to P_a is fitted beside V_0 (what has left by then is the
+        integral of P_a over its time constant, times V_0), and the time by which the pressure lags behind the pump in
+        tubing and sensor: without that the fit would take a stroke's lag for a leak.
 
     Raises
     ------
@@ -62,13 +63,17 @@ def fit_boyle(
     if interval is not None:
         lost = np.concatenate([[0.0], np.cumsum((pressure[1:] + pressure[:-1]) / 2)]) * interval
         scaled = lost / (atmosphere + pressure)
-        columns.append(scaled / max(float(np.abs(scaled).max()), 1e-30))
+        columns += [_of_unit_size(scaled), _of_unit_size(np.gradient(pumped))]
     design = np.stack(columns, axis=1)
     solution, _, _, _ = np.linalg.lstsq(design, pumped, rcond=None)
     residual = np.asarray(pumped - design @ solution, dtype=np.float64)
     variance = float(residual @ residual) / (pumped.size - design.shape[1])
     covariance = np.linalg.inv(design.T @ design) * variance
     return BoyleFit(float(solution[0]), float(np.sqrt(covariance[0, 0])), float(solution[1]), residual)
+
+
+def _of_unit_size(column: Array) -> Array:
+    return column / max(float(np.abs(column).max()), 1e-30)
 
 
 @extraction_step(
@@ -79,7 +84,7 @@ def fit_boyle(
     after=("segments",),
 )
 def volume(work: Extraction) -> Details:
-    """Fit dV = V_0 P_a / (P_atm + P_a), and a leak beside it, to 50 ms means of the whole record.
+    """Fit dV = V_0 P_a / (P_atm + P_a), with a leak and a lag of the pressure, to 50 ms means of the whole record.
 
     Temperature is taken as constant: the pump must move slowly, or wait.
     """

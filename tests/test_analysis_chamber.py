@@ -30,6 +30,21 @@ def test_boyle_recovers_the_volume_exactly_without_noise() -> None:
     assert fit.uncertainty < 1e-12
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize("tightness", [300.0, 3000.0])
+def test_neither_a_leak_nor_a_lag_of_the_pressure_shifts_the_volume(delay: float, tightness: float) -> None:
+    volume, interval = 7.2e-6, 0.05
+    time = np.arange(0.0, 40.0, interval)
+    pumped = 2e-7 * np.interp(time, np.arange(0, 41, 4), [0, -0.5, -0.5, -1, -1, 0, 0, 0.5, 0.5, 0, 0])
+    gas = np.zeros_like(time)
+    leaked = 0.0
+    for k, moved in enumerate(pumped):
+        gas[k] = STANDARD_ATMOSPHERE * (volume - leaked) / (volume - moved) - STANDARD_ATMOSPHERE
+        leaked += volume * gas[k] / STANDARD_ATMOSPHERE / tightness * interval
+    shown = np.interp(time - delay, time, gas)
+    assert fit_boyle(pumped, shown, interval=interval).volume == pytest.approx(volume, rel=1e-3)
+
+
 def test_volume_protocol_states_gain_and_pump_errors() -> None:
     sensors = Sensors(pressure_gain=3e-3, pump_volume=4e-3)
     quantity = analyze(volume_run(7.2e-6, sensors=sensors)).features["chamber_volume_m3"]
