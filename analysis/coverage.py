@@ -26,6 +26,9 @@ SENSORS = Sensors(
     position=1e-4,
     compliance=12e-6,
     compliance_uncertainty=1e-6,
+    creep=0.06,
+    creep_uncertainty=0.003,
+    creep_time=9.0,
     pump_volume=2e-3,
 )
 """A good bench; the synthetic tests draw their calibration errors from these standard uncertainties."""
@@ -48,6 +51,8 @@ def _imperfections(generator: np.random.Generator) -> Imperfections:
         pressure_offset=SENSORS.pressure_offset * normal(),
         position_gain=SENSORS.position * normal(),
         compliance=SENSORS.compliance + SENSORS.compliance_uncertainty * normal(),
+        creep=SENSORS.creep + SENSORS.creep_uncertainty * normal(),
+        creep_time=SENSORS.creep_time,
         resolution=1.5e-4,
     )
 

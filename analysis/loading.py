@@ -15,6 +15,8 @@ ContactMethod = Callable[[Array, Array, float], int]
 
 CONTACT_METHODS: dict[str, tuple[str, ContactMethod]] = {}
 POINTS = 1500
+FEWEST_FOR_LINE = 8
+"""Cells before contact that show a drift; fewer show noise."""
 
 
 def contact_method(name: str) -> Callable[[ContactMethod], ContactMethod]:
@@ -132,6 +134,7 @@ def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
     """Return depth (rising evenly) and force of the approach, averaged in cells of depth, and the noise of one cell.
 
     A line through the part before contact is removed: here drift within the approach counts, not over the whole test.
+    Where that part is very short its mean is.
     """
     if work.windows.approach is None:
         raise FeatureMissing("the run has no approach")
@@ -153,7 +156,12 @@ def _approach_curve(work: Extraction) -> tuple[Array, Array, float]:
     per_cell = samples / max(1.0, cells * (touch - first) / (grid[-1] - first))
     force = on_grid(depth, work.force[start:stop], grid)
     before = grid < touch - 0.1 * (touch - first)
-    force = force - np.polynomial.Polynomial.fit(grid[before], force[before], 1)(grid)
+    known = int(np.count_nonzero(before))
+    if not known:
+        raise FeatureMissing("no sample before contact")
+    force = force - np.polynomial.Polynomial.fit(grid[before], force[before], 1 if known >= FEWEST_FOR_LINE else 0)(
+        grid
+    )
     return grid, force, max(work.noise.of_mean(per_cell), float(force[before].std()))
 
 

@@ -116,7 +116,7 @@ def detachment(work: Extraction) -> Details:
     2. The separation is the stage's height half a sample later, less the load train's stretch, compliance times force:
        the train springs back only when the contact is lost. Contacts run away before that: within the sample that is
        not seen the force is taken to fall by twice as much as in the one before, and by that much uncertain. A JKR
-       contact loses its force with its area: there half of what would be left counts, uncertain from that to nothing.
+       contact loses its force with its area: what would be left counts the less, the more the fall grows.
     3. Without such a jump: where the tension falls below four standard deviations of a 20 ms mean.
     """
     start, _ = work.retraction()
@@ -150,9 +150,12 @@ def _held(work: Extraction, last: int) -> tuple[float, float]:
     """Return the force at the end of the contact, after the last sample in tension, and its standard uncertainty, N."""
     seen, fall = float(work.force[last]), float(work.force[last] - work.force[last - 1])
     left = min(seen + 2 * fall, 0.0)
-    if work.run.protocol == "indentation":
-        return left / 2, abs(seen) / 2 / 6**0.5  # triangular, between the last force seen and none
-    return left, abs(left - seen) / 3**0.5  # rectangular
+    if work.run.protocol != "indentation":
+        return left, abs(left - seen) / 3**0.5
+    before = float(work.force[last - 1] - work.force[last - 4]) / 3
+    growth = (fall - before - 3 * work.noise.sigma) / fall if fall > 0 else 0.0  # two deviations of that difference
+    held = left * (1 - min(max(growth, 0.0), 1.0))
+    return held, abs(held - seen) / 3
 
 
 def _last_tense(work: Extraction, jump: ForceJump) -> int:

@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 
+from analysis.creep import delayed
 from analysis.numerics import Array
 from analysis.run import Run, Sensors, Step
 from model.jkr import jkr_curve
@@ -52,8 +53,8 @@ class Imperfections:
         Correlation of successive force samples' noise (AR(1) coefficient), 0 for white.
     drift, wander
         Drift of the zero of force, N/s, and the amplitude of its slow waves (about 200, 600 and 1800 s), N.
-    creep
-        Share of the present load that the cell adds, slowly (60 s): load-cell creep.
+    creep, creep_time
+        Share of a compression that the load train loses to the reading, and the time constant, s (``analysis.creep``).
     bow
         What the calibration line is out by under tension and under compression, N.
     force_gain, pressure_gain, position_gain
@@ -72,6 +73,7 @@ class Imperfections:
     drift: float = 0.0
     wander: float = 0.0
     creep: float = 0.0
+    creep_time: float = 9.0
     bow: tuple[float, float] = (0.0, 0.0)
     force_gain: float = 0.0
     pressure_gain: float = 0.0
@@ -138,7 +140,7 @@ def pull_off_run(
         steps.append(Step(name, start, start + part.size))
         start += part.size
     time = np.arange(force.size) / test.rate
-    measured = force + flaws.creep * _creep(force, test.rate)
+    measured = force - flaws.creep * delayed(force, 1 / test.rate, flaws.creep_time)
     measured = measured + np.where(force < 0, *flaws.bow) * np.tanh(50 * np.abs(force) / test.preload)
     measured = (
         measured * (1 + flaws.force_gain) + 0.05 + _drift(generator, time, flaws) + _noise(generator, force.size, flaws)
@@ -223,13 +225,6 @@ def _drift(generator: np.random.Generator, time: Array, flaws: Imperfections) ->
         phase = generator.uniform(0, 2 * np.pi)
         drift = drift + flaws.wander * generator.normal() * np.sin(2 * np.pi * time / period + phase)
     return np.asarray(drift, dtype=np.float64)
-
-
-def _creep(force: Array, rate: float) -> Array:
-    from scipy.signal import lfilter
-
-    pole = float(np.exp(-1 / (60.0 * rate)))
-    return np.asarray(lfilter([1 - pole], [1, -pole], force), dtype=np.float64)
 
 
 def _noise(generator: np.random.Generator, count: int, flaws: Imperfections) -> Array:

@@ -122,14 +122,18 @@ def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
             if pressure is None:
                 yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt)
                 continue
-            stem += f"-{pressure:+g}kPa"
+            stem = f"{re.sub('-(high|low|vented)$', '', stem)}_{pressure:+g}kPa"
             changed, changed_text = _at_pressure(text, pressure, f"{source} at {pressure:g} kPa")
             yield from _places(changed, changed_text, stem, repeats, campaign.seed, section.prompt)
 
 
 def _at_pressure(text: str, pressure: float, source: str) -> tuple[Scene, str]:
-    """Return scene and text at another pressure; what is recorded is what is run."""
+    """Return scene and text at another pressure; what is recorded is what is run, in its title too."""
     lines = [line for line in text.splitlines() if not re.match(r"\s*initial_pressure_kPa\s*=", line)]
+    lines = [
+        re.sub(r"[-+]?\d+(\.\d+)? kPa", f"{pressure:+g} kPa", line) if re.match(r"\s*title\s*=", line) else line
+        for line in lines
+    ]
     place = next((i for i, line in enumerate(lines) if re.match(r"\s*\[\s*protocol\s*\]", line)), None)
     if place is None:
         lines += ["", "[protocol]", 'name = "pull_off"']

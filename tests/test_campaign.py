@@ -65,6 +65,7 @@ def test_table_s1_is_eight_conditions_five_times():
     assert (len(tests), len(conditions), len({test.key for test in tests})) == (40, 8, 40)
     for test in tests:
         assert f"initial_pressure_kPa = {test.scene.protocol.initial_pressure_kPa!r}" in test.scene_text
+        assert f" at {test.scene.protocol.initial_pressure_kPa:+g} kPa" in test.scene.title
 
 
 def test_a_campaign_that_ships_is_found_by_its_name(tmp_path, monkeypatch):

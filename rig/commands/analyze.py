@@ -135,10 +135,10 @@ def _write(arguments: argparse.Namespace, runs: list[Analyzed]) -> None:
         from analysis.report import Report, write_html, write_pdf
 
         report = Report(runs, [source(path) for path in arguments.recordings], arguments.model, arguments.title)
-        if arguments.report is not None:
-            write_html(report, arguments.report)
-        if arguments.pdf is not None:
-            write_pdf(report, arguments.pdf)
+        for path, write in ((arguments.report, write_html), (arguments.pdf, write_pdf)):
+            if path is not None:
+                write(report, path)
+                print(f"report     {path}", file=sys.stderr)
     if arguments.curves is not None:
         _write_curves(arguments.curves, runs)
     if arguments.afm is not None:

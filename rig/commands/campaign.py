@@ -53,10 +53,13 @@ def run(arguments: argparse.Namespace) -> int:
     found = f", {len(adopted)} of them found whole without an entry" if adopted else ""
     print(f"{campaign.title}: {len(tests)} tests, {len(tests) - len(todo)} done{found}", file=sys.stderr)
     with tqdm(total=len(todo), unit="test", disable=not (sys.stderr.isatty() and bench.is_emulated)) as bar:
-        for code in _run_all(todo, bench, bench_text, journal, arguments):
-            bar.update()
+        for number, code in enumerate(_run_all(todo, bench, bench_text, journal, arguments), start=1):
             if code:
                 return code
+            bar.update()
+            if bar.disable:
+                print(f"{number} of {len(todo)} tests done", file=sys.stderr)
+    print(f"recordings {folder}", file=sys.stderr)
     if arguments.report is not None:
         from rig.cli import main
 
