@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 DISPLAY = {"m": ("mm", 1e3), "Pa": ("kPa", 1e-3), "J": ("mJ", 1e3), "m^2": ("cm²", 1e4), "m^3": ("mL", 1e6)}
 """Units people read, by SI unit, with the factor."""
 
+SMALL = 1e-3
+"""Numbers below it are written with an exponent."""
+
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
@@ -44,11 +47,15 @@ class Quantity:
 
 
 def with_uncertainty(value: float, uncertainty: float) -> str:
-    """Write a value rounded to two significant digits of its uncertainty."""
+    """Write a value rounded to two significant digits of its uncertainty; very small ones with an exponent."""
     if not math.isfinite(value):
         return "–"
     if not math.isfinite(uncertainty) or uncertainty <= 0:
         return f"{value:.5g}"
+    largest = max(abs(value), uncertainty)
+    if largest < SMALL:
+        exponent = math.floor(math.log10(largest))
+        return f"({with_uncertainty(value / 10.0**exponent, uncertainty / 10.0**exponent)})e{exponent}"
     decimals = 1 - math.floor(math.log10(uncertainty))
     if decimals < 0:
         return f"{round(value, decimals):.0f} ± {round(uncertainty, decimals):.0f}"

@@ -130,7 +130,7 @@ h3{font-size:1rem;margin:1.6rem 0 .4rem}
 table{border-collapse:collapse;margin:.8rem 0;font-size:.84rem;display:block;overflow-x:auto}
 caption{text-align:left;font-weight:600;padding:.3rem 0}
 th,td{padding:.22rem .6rem;border-bottom:1px solid #e2e2e2;text-align:left;vertical-align:top}
-td{font-variant-numeric:tabular-nums;white-space:nowrap}details td{white-space:normal}
+td{font-variant-numeric:tabular-nums;white-space:nowrap}details td:last-child{white-space:normal}
 thead th{border-bottom:2px solid #999;white-space:nowrap}
 tbody th{font-weight:500}.note{font-size:.8rem;color:#555;margin:.1rem 0}
 img{max-width:100%;height:auto}.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(24rem,1fr));gap:1rem}

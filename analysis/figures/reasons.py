@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +36,10 @@ def draw_reasons(figure: Figure, analysis: Analysis) -> None:
             axes.text(0.5, 0.5, words, ha="center", va="center", wrap=True, transform=axes.transAxes, fontsize=8)
 
 
+def _title(axes: Axes, step: str, decision: object) -> None:
+    axes.set_title(fill(f"{step}: {decision}", 56), loc="left", fontsize=8.5)
+
+
 def _tare(axes: Axes, analysis: Analysis) -> None:
     run, details = analysis.run, analysis.work.details["tare"]
     baseline = analysis.work.baseline
@@ -50,7 +55,7 @@ def _tare(axes: Axes, analysis: Analysis) -> None:
     noise = 1e3 * analysis.work.noise.sigma
     drift = 1e3 * abs(float(baseline(ends[1]) - baseline(ends[0])))
     axes.set_ylim(-8 * noise - drift, 8 * noise + drift)
-    axes.set_title(f"Tare: {details['decision']}", loc="left", fontsize=8.5)
+    _title(axes, "Tare", details["decision"])
     axes.set_xlabel("Time [s]")
     axes.set_ylabel("Force minus tare [mN]")
 
@@ -68,7 +73,7 @@ def _contact(axes: Axes, analysis: Analysis) -> None:
             (place - origin) * 1e6, color=color, linewidth=1.2, label=f"{name}: {(place - origin) * 1e6:+.1f} µm"
         )
     axes.axvline(0, color=BLACK, linestyle=":", linewidth=1.2)
-    axes.set_title(f"Contact: {details['decision']}", loc="left", fontsize=8.5)
+    _title(axes, "Contact", details["decision"])
     axes.set_xlabel("Separation from contact [µm]")
     axes.set_ylabel("Force [mN]")
     axes.legend(fontsize=7)
@@ -85,7 +90,7 @@ def _peak(axes: Axes, analysis: Analysis) -> None:
     inside = np.linspace(fit.start, fit.stop - 1, 200)
     axes.plot(inside / analysis.run.rate, fit.polynomial(inside) * 1e3, color=ORANGE)
     axes.plot(work.peak / analysis.run.rate, fit(work.peak) * 1e3, "v", color=BLACK)
-    axes.set_title(f"Pull-off: {details['decision']}", loc="left", fontsize=8.5)
+    _title(axes, "Pull-off", details["decision"])
     axes.set_xlabel("Time [s]")
     axes.set_ylabel("Force [mN]")
 
@@ -101,6 +106,6 @@ def _detachment(axes: Axes, analysis: Analysis) -> None:
     axes.plot(time, smooth * 1e3, color=GREEN, linewidth=0.8)
     axes.axvline(0, color=BLACK, linestyle=":")
     axes.axhline(0, color=GREY, linewidth=0.7)
-    axes.set_title(f"Detachment: {work.details['detachment']['decision']}", loc="left", fontsize=8.5)
+    _title(axes, "Detachment", work.details["detachment"]["decision"])
     axes.set_xlabel("Time from detachment [ms]")
     axes.set_ylabel("Force [mN]")

@@ -147,6 +147,8 @@ def _against_retraction(axes: Axes, run: Run, analysis: Analysis, prediction: Pr
     twin = None
     if curve.pressure is not None:
         twin = _pressure_axis(axes)
+        axes.set_zorder(twin.get_zorder() + 1)  # the words on the force lie above the pressure
+        axes.patch.set_visible(False)
         smooth = _smooth(curve.pressure, run.rate) * 1e-3
         lines += twin.plot(*thin(curve.retraction * 1e3, smooth), color=ORANGE, label=r"$P_a$ measured")
     if prediction is not None and prediction.retraction.size:
