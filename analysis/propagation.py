@@ -168,9 +168,11 @@ def _sampling(work: Extraction) -> dict[str, float]:
 
 
 def _stage_noise(work: Extraction, index: float) -> float:
-    """How far the stage's position scatters about a steady motion within half a second, m."""
-    reach = work.samples(0.25, least=8)
-    part = work.run.height[max(0, int(index) - reach) : int(index) + reach]
+    """How far the stage's position scatters about a steady motion within half a second of the retraction, m."""
+    length = work.samples(0.5, least=16)
+    start, stop = work.retraction()
+    first = max(start, min(int(index) - length // 2, stop - length))
+    part = work.run.height[first : first + length]
     places = np.arange(part.size, dtype=np.float64)
     return float(np.std(part - np.polynomial.Polynomial.fit(places, part, 1)(places)))
 
