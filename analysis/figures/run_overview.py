@@ -147,8 +147,6 @@ def _against_retraction(axes: Axes, run: Run, analysis: Analysis, prediction: Pr
     twin = None
     if curve.pressure is not None:
         twin = _pressure_axis(axes)
-        axes.set_zorder(twin.get_zorder() + 1)  # the words on the force lie above the pressure
-        axes.patch.set_visible(False)
         smooth = _smooth(curve.pressure, run.rate) * 1e-3
         lines += twin.plot(*thin(curve.retraction * 1e3, smooth), color=ORANGE, label=r"$P_a$ measured")
     if prediction is not None and prediction.retraction.size:
@@ -161,7 +159,7 @@ def _against_retraction(axes: Axes, run: Run, analysis: Analysis, prediction: Pr
             label = f"$P_a$ model{ANCHORED.get(prediction.assumptions.get('gas anchor', ''), '')}"
             lines += twin.plot(place, prediction.pressure[stable] * 1e-3, ":", color=BLACK, linewidth=1.4, label=label)
     _limits(axes, analysis, prediction)
-    _annotate(axes, analysis)
+    _annotate(axes, twin or axes, analysis)
     axes.legend(handles=lines, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(lines))
 
 
@@ -181,15 +179,17 @@ def _limits(axes: Axes, analysis: Analysis, prediction: Prediction | None) -> No
     axes.set_ylim(low - 0.16 * (high - low), high + 0.08 * (high - low))
 
 
-def _annotate(axes: Axes, analysis: Analysis) -> None:
+def _annotate(axes: Axes, foremost: Axes, analysis: Analysis) -> None:
+    """Mark F_p and D_p on the force; the words stand on the foremost axes, above every curve."""
     features = analysis.features
     if "pull_off_force_N" in features:
         force, place = features.value("pull_off_force_N"), features.value("retraction_at_pull_off_m") * 1e3
         axes.plot(place, -force, "v", color=BLACK, markersize=6, zorder=6)
-        axes.annotate(
+        foremost.annotate(
             rf"$F_p$ = {features['pull_off_force_N']}",
             (place, -force),
             xytext=(0, -9),
+            xycoords=axes.transData,
             textcoords="offset points",
             ha="center",
             va="top",
@@ -199,10 +199,11 @@ def _annotate(axes: Axes, analysis: Analysis) -> None:
     if "pull_off_distance_m" in features:
         distance = features.value("pull_off_distance_m") * 1e3
         axes.plot(distance, 0, "|", color=BLACK, markersize=10, zorder=6)
-        axes.annotate(
+        foremost.annotate(
             rf"$D_p$ = {features['pull_off_distance_m']}",
             (distance, 0),
             xytext=(-4, 5),
+            xycoords=axes.transData,
             textcoords="offset points",
             ha="right",
             va="bottom",
