@@ -56,8 +56,9 @@ def journal(folder):
     return [json.loads(line) for line in (folder / JOURNAL).read_text("utf-8").splitlines()]
 
 
-def test_table_s1_is_eight_conditions_five_times():
-    campaign, tests = load_campaign(Path(__file__).parents[1] / "campaigns" / "table-s1.toml")
+@pytest.mark.parametrize("name", ["table-s1", "table-s2"])
+def test_the_tables_are_eight_conditions_five_times(name):
+    campaign, tests = load_campaign(Path(__file__).parents[1] / "campaigns" / f"{name}.toml")
     conditions = {
         (t.scene.substrate.shape, t.scene.substrate.diameter_mm, t.scene.protocol.initial_pressure_kPa) for t in tests
     }
