@@ -27,6 +27,7 @@ from model.membrane_contact import Contact, Surface, frozen
 from model.membrane_equilibrium import Annulus, Closure, Gas, resample, shape
 from model.membrane_equilibrium import solve as solve_states
 from model.membrane_path import (
+    Coarse,
     Features,
     Memory,
     Panel,
@@ -246,11 +247,12 @@ def _from_nothing(
     branch: list[Line] = []
     try:
         branch = release_branch(scaled.annulus, scaled.width, scaled.start, counter, orders[0])
-        if not _rises_above_start(scaled, branch):
+        coarse = Coarse.of(scaled.annulus, branch)
+        if not coarse.rises_above(scaled.start):
             return _no_equilibrium(scaled.annulus.gas)
-        if _ends_highest(scaled, branch):
+        if _ends_highest(scaled, coarse):
             raise NotConverged(ENDS_HIGHEST)
-        return _refined(scaled, branch, tolerance, counter, memory, orders[0])
+        return _refined(scaled, coarse, tolerance, counter, memory, orders[0])
     except NotConverged:
         if _folds_back(scaled, branch):
             return Outcome.SELF_CONTACT
@@ -259,11 +261,10 @@ def _from_nothing(
     return _from_nothing(scaled, tolerance, counter, memory, orders[1:])
 
 
-def _ends_highest(scaled: Scene, branch: list[Line]) -> bool:
+def _ends_highest(scaled: Scene, coarse: Coarse) -> bool:
     """Whether the branch breaks off at its highest point towards wider contacts: a higher one may be missing."""
-    heights = [shape(scaled.annulus, line.coordinate, line.state).height for line in branch]
-    highest = int(np.argmax([part.max() for part in heights]))
-    return int(np.argmax(heights[highest])) == 0 and branch[highest].coordinate[0] != scaled.width
+    highest = coarse.highest
+    return int(np.argmax(coarse.heights[highest])) == 0 and coarse.lines[highest].coordinate[0] != scaled.width
 
 
 def _folds_back(scaled: Scene, branch: list[Line]) -> bool:
@@ -302,18 +303,12 @@ def _read(scaled: Scene, peel: list[Panel], pinned: list[Panel], counter: Counte
     return Found(pieces, read, errors, _relative(read, errors))
 
 
-def _rises_above_start(scaled: Scene, branch: list[Line]) -> bool:
-    return any((shape(scaled.annulus, line.coordinate, line.state).height > scaled.start).any() for line in branch)
-
-
-def _refined(
-    scaled: Scene, branch: list[Line], tolerance: float, counter: Counter, memory: Memory, coarse: int
-) -> Found:
+def _refined(scaled: Scene, coarse: Coarse, tolerance: float, counter: Counter, memory: Memory, searched: int) -> Found:
     """Raise the order of the shape until the features stand still."""
     found: Found | None = None
-    for order in (order for order in ORDERS if order > coarse):
+    for order in (order for order in ORDERS if order > searched):
         resolution = _resolution(scaled, order, tolerance)
-        peel = peel_panels(scaled.annulus, branch, scaled.start, resolution, counter)
+        peel = peel_panels(scaled.annulus, coarse, scaled.start, resolution, counter)
         begins_pinned = peel[0].coordinate[0] == scaled.width
         pinned = []
         if begins_pinned:

@@ -133,12 +133,32 @@ class Resolution(NamedTuple):
     deepest: int
 
 
+class Coarse(NamedTuple):
+    """The peeling branch as it was searched, in stretches, with the heights along each."""
+
+    lines: list[Line]
+    heights: list[Array]
+
+    @classmethod
+    def of(cls, annulus: Annulus, lines: list[Line]) -> Coarse:
+        """Work out the heights of a branch."""
+        return cls(lines, [shape(annulus, line.coordinate, line.state).height for line in lines])
+
+    @property
+    def highest(self) -> int:
+        """Which stretch has the highest point."""
+        return int(np.argmax([part.max() for part in self.heights]))
+
+    def rises_above(self, floor: float) -> bool:
+        """Whether any point lies above a height."""
+        return any((part > floor).any() for part in self.heights)
+
+
 def peel_panels(
-    annulus: Annulus, branch: list[Line], floor: float, resolution: Resolution, counter: Counter
+    annulus: Annulus, coarse: Coarse, floor: float, resolution: Resolution, counter: Counter
 ) -> list[Panel]:
     """Return the peeling branch from where it rises above ``floor`` to its highest point."""
-    heights = [shape(annulus, line.coordinate, line.state).height for line in branch]
-    highest = int(np.argmax([part.max() for part in heights]))
+    branch, heights, highest = coarse.lines, coarse.heights, coarse.highest
     rising = next(i for i, part in enumerate(heights) if (part > floor).any())
     panels = []
     for i in range(rising, highest + 1):
