@@ -327,6 +327,9 @@ def _check_kinds(entry: h5py.Group) -> None:
     for name, table in _TABLES.items():
         if name in entry and (entry[name].ndim != 1 or entry[name].dtype.names != table.names):
             raise ValueError(f"{name} is not the table it should be")
+    for name, item in entry["configuration"].items():
+        if item.shape != ():
+            raise ValueError(f"configuration/{name} is not one text")
 
 
 def _read(entry: h5py.Group, path: Path) -> Recording:

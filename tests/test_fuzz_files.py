@@ -165,3 +165,14 @@ def test_a_recording_with_a_wrong_part_is_refused(part, change, recorded, tmp_pa
             entry[part] = [[[1.0]]]
     with pytest.raises(FileError, match=r"wrong\.h5"):
         load_recording(path)
+
+
+def test_a_text_of_a_recording_that_is_many_texts_is_refused(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr("rig.recording.probe", lambda path: None)
+    path = tmp_path / "wrong.h5"
+    path.write_bytes(recorded)
+    with h5py.File(path, "r+") as file:
+        notes = file["entry/configuration"]
+        notes["place"] = ["top", "left"]
+    with pytest.raises(FileError, match="place is not one text"):
+        load_recording(path)
