@@ -173,6 +173,7 @@ def test_a_text_of_a_recording_that_is_many_texts_is_refused(recorded, tmp_path,
     path.write_bytes(recorded)
     with h5py.File(path, "r+") as file:
         notes = file["entry/configuration"]
+        del notes["place"]
         notes["place"] = ["top", "left"]
     with pytest.raises(FileError, match="place is not one text"):
         load_recording(path)
