@@ -63,7 +63,23 @@ def test_extreme_scenes_end_soundly(parameters, contact_stretch):
         assert solved.pull_off_distance >= -solved.numerical_error["pull_off_distance"] - 1e-30
         assert 0 <= solved.detachment_radius <= cone.start_radius(parameters.substrate, parameters.gripper)
         assert all(error >= 0 and math.isfinite(error) for error in solved.numerical_error.values())
-        assert (np.diff(solved.position) >= -1e-15 * np.abs(solved.position).max() - 1e-30).all()
+        # Zero and peak of the force are marked on the path, each where it is known to be.
+        marked = solved.numerical_error["zero_force_position"] + solved.numerical_error["retraction_at_pull_off"]
+        assert (np.diff(solved.position) >= -1e-15 * np.abs(solved.position).max() - 1e-30 - marked).all()
+
+
+NOTHING_TO_PULL = Parameters(
+    Substrate("sphere", 0.016),
+    Gripper(0.008, 0.008, 1.0),
+    Membrane(math.exp(7.0), math.exp(-6.0), 0.0),
+    Gas(-1.790337893666624e-295),
+)
+
+
+def test_a_force_that_is_less_than_its_rounding_error_says_so():
+    solved = cone.solve(NOTHING_TO_PULL, contact_stretch=False)
+    assert solved.numerical_error["pull_off_force"] > solved.pull_off_force
+    assert any("rounding error" in warning for warning in solved.warnings)
 
 
 @MANY

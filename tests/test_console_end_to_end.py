@@ -136,10 +136,16 @@ def attached() -> Link:
 def told(link: Link, kind: type, count: int = 1) -> list[object]:
     """Take messages until ``count`` of a kind have come; return all of them."""
     got: list[object] = []
-    wait_for(
-        lambda: (got.extend(link.take()), sum(isinstance(message, kind) for message in got) >= count)[1],
-        f"{count} {kind.__name__}",
-    )
+
+    def enough() -> bool:
+        got.extend(link.take())
+        if sum(isinstance(message, kind) for message in got) >= count:
+            return True
+        endings = [message for message in got if isinstance(message, Ending)]
+        assert not endings, f"the run has ended before {count} {kind.__name__}: {endings}"
+        return False
+
+    wait_for(enough, f"{count} {kind.__name__}")
     return got
 
 
