@@ -18,7 +18,7 @@ RESERVED = frozenset({-50103, -200022})
 @contextmanager
 def translated(connection: str = "") -> Iterator[None]:
     """Turn whatever nidaqmx raises into the rig's errors."""
-    from nidaqmx.errors import DaqError, DaqNotFoundError, Error, RpcError
+    from nidaqmx.errors import DaqError, DaqNotFoundError, DaqWarning, Error, RpcError
 
     try:
         yield
@@ -36,7 +36,16 @@ def translated(connection: str = "") -> Iterator[None]:
         ) from error
     except Error as error:
         raise NotConnected("daq", f"{error}", "install a current NI-DAQmx runtime (ni.com/downloads).") from error
-    except (ValueError, TypeError, LookupError, AssertionError, ArithmeticError, UnboundLocalError) as error:
+    except (
+        ValueError,
+        TypeError,
+        LookupError,
+        AssertionError,
+        ArithmeticError,
+        UnboundLocalError,
+        DaqWarning,
+    ) as error:
+        # A warning is raised only where warnings are made errors.
         # UnboundLocalError: nidaqmx 1.7.0 has no answer to a failed call whose error code is 0 or a warning's.
         raise BadReply(
             "daq", f"nidaqmx could not make sense of an answer ({type(error).__name__}: {error})."

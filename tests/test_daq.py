@@ -420,6 +420,7 @@ answers = st.one_of(
 @example(answer=response(status=0, read_array=[1.0] * 60, samps_per_chan_read=20))
 @example(answer=response(status=0, read_array=[1.0] * 59, samps_per_chan_read=20))
 @example(answer=response(status=0, read_array=[1.0] * 61, samps_per_chan_read=20))
+@example(answer=response(status=1))
 @example(answer=response(status=-200284, read_array=[1.0] * 2, samps_per_chan_read=7))
 @example(answer=response(status=-200284, read_array=[1.0] * 60, samps_per_chan_read=-7))
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
