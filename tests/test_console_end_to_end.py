@@ -22,7 +22,7 @@ from rig.recording import load_recording
 from rig.wire import Samples
 
 pytestmark = [
-    pytest.mark.timeout(240),
+    pytest.mark.timeout(600),
     pytest.mark.skipif(sys.platform == "win32", reason="X and SIGSTOP are POSIX"),
 ]
 
@@ -42,7 +42,7 @@ tare_s = 0.5
 
 def wait_for(condition: Callable[[], object], what: str) -> None:
     """Wait as long as the test may last; its time-out bounds it."""
-    for _ in range(10_000):
+    for _ in range(25_000):
         if condition():
             return
         time.sleep(0.02)
