@@ -157,7 +157,9 @@ def fit_contact(
     place, pull = block_means(separation, length), block_means(force, length)
     if place.size < 12 or pull.min() >= 0:
         raise FeatureMissing("the retraction holds no tension to fit")
-    return sorted((_fit(model, place, pull, radius) for model in models), key=lambda fit: fit.misfit)
+    work, modulus, origin = _first_guess(place, pull, radius)
+    first = _cornered("JKR", place, pull, radius, [math.log(work), math.log(modulus)], origin)
+    return sorted((_fit(model, place, pull, radius, first) for model in models), key=lambda fit: fit.misfit)
 
 
 def _jkr(depth: Array, logs: Array, radius: float) -> tuple[Array, Array]:
@@ -167,7 +169,7 @@ def _jkr(depth: Array, logs: Array, radius: float) -> tuple[Array, Array]:
     fold = root**4 / radius - 2 * math.sqrt(pull) * root
     reached = np.maximum(depth, fold * (1 - 1e-12))
     contact = jkr.jkr_contact_radius(reached, work, radius, modulus)
-    return 4 * modulus * (contact**3 / (3 * radius) - np.sqrt(pull * contact**3)), contact
+    return jkr.jkr_force_at(contact, work, radius, modulus), contact
 
 
 def _dmt(depth: Array, logs: Array, radius: float) -> tuple[Array, Array]:
@@ -198,9 +200,8 @@ def _force(model: str, depth: Array, corner: float, logs: Array, radius: float) 
     return force + 2 * math.exp(logs[1]) * contact * np.maximum(depth - corner, 0.0)
 
 
-def _fit(model: str, place: Array, pull: Array, radius: float) -> ContactFit:
-    work, modulus, origin = _first_guess(place, pull, radius)
-    first = _cornered("JKR", place, pull, radius, [math.log(work), math.log(modulus)], origin)
+def _fit(model: str, place: Array, pull: Array, radius: float, first: ContactFit) -> ContactFit:
+    """Fit a model, starting from the fit of JKR."""
     if model == "JKR":
         return first
     logs = [math.log(first.work_of_adhesion), math.log(first.modulus)]

@@ -104,8 +104,8 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
     profile = sample(branch, path, (zero, peak), points)
     detachment = path.detachment
     length, force = scales.length, scales.force
-    errors = of_features(branch, zero, peak, detachment)
     energy, energy_error = adhesion_energy(branch, path, zero, profile)
+    errors = of_features(branch, zero, peak, detachment) | {"adhesion_energy": energy_error}
     units = {"pull_off_force": force, "adhesion_energy": scales.energy}
     return Prediction(
         name,
@@ -126,10 +126,7 @@ def solve(parameters: Parameters, *, contact_stretch: bool = True, points: int =
         contact_radius=profile.radius * length,
         stable=np.ones(len(profile.radius), dtype=bool),
         jumps=tuple(_jumps(path, scales)),
-        numerical_error={
-            name: error * units.get(name, length)
-            for name, error in (errors | {"adhesion_energy": energy_error}).items()
-        },
+        numerical_error={name: error * units.get(name, length) for name, error in errors.items()},
         runtime_s=time.perf_counter() - begin,
         evaluations=cone.evaluations,
         warnings=_warnings(cone, height, errors["pull_off_force"] / -peak.force),

@@ -113,7 +113,7 @@ def jkr_curve(
     fold = float(np.cbrt(radius**2 * pull / 4))
     contact = _falling(largest_contact, fold, points)
     indentation = contact**2 / radius - 2 * np.sqrt(pull * contact)
-    force = 4 * modulus * (contact**3 / (3 * radius) - np.sqrt(pull * contact**3))
+    force = jkr_force_at(contact, work_of_adhesion, radius, modulus)
     return ContactCurve(indentation, force, contact)
 
 
@@ -143,6 +143,11 @@ def jkr_contact_radius(indentation: ArrayLike, work_of_adhesion: float, radius: 
 def jkr_force(indentation: ArrayLike, work_of_adhesion: float, radius: float, modulus: float) -> Array:
     """Return the exact JKR force at given indentations, N; nan where no contact is stable."""
     contact = jkr_contact_radius(indentation, work_of_adhesion, radius, modulus)
+    return jkr_force_at(contact, work_of_adhesion, radius, modulus)
+
+
+def jkr_force_at(contact: Array, work_of_adhesion: float, radius: float, modulus: float) -> Array:
+    """Return the JKR force at given contact radii, N."""
     pull = math.pi * work_of_adhesion / (2 * modulus)
     return np.asarray(4 * modulus * (contact**3 / (3 * radius) - np.sqrt(pull * contact**3)), dtype=float)
 
