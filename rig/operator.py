@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import sys
 import threading
@@ -19,7 +20,7 @@ class Keyboard:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = sys.stdin if stream is None else stream
-        self._lines: queue.Queue[bool] = queue.Queue()
+        self._presses: queue.Queue[None] = queue.Queue()
         self._lock = threading.Lock()
         self._controls: Controls | None = None
         self._thread: threading.Thread | None = None
@@ -35,18 +36,14 @@ class Keyboard:
         """
         with self._lock:
             self._controls = None
-            while not self._lines.empty():
-                self._lines.get_nowait()
+            while not self._presses.empty():
+                self._presses.get_nowait()
         print(f"{text} Press Enter to go on. ", end="", file=sys.stderr, flush=True)
         self._read()
-        while True:
-            try:
-                answered = not self._closed and self._lines.get(timeout=0.2)
-            except queue.Empty:  # wakes up for Ctrl-C
-                continue
-            if not answered:
-                raise Refused(f"{text} Nobody can answer: standard input is closed. Remedy: run it in a terminal")
-            return
+        while not (self._closed and self._presses.empty()):
+            with contextlib.suppress(queue.Empty):  # wakes up for Ctrl-C
+                return self._presses.get(timeout=0.2)
+        raise Refused(f"{text} Nobody can answer: standard input is closed. Remedy: run it in a terminal")
 
     def answer_for(self, controls: Controls) -> bool:
         """Let the next Enter resume a run; return whether anyone can press it."""
@@ -67,13 +64,12 @@ class Keyboard:
         except (OSError, ValueError) as error:  # the terminal is gone
             print(f"rig: the keyboard cannot be read any more ({error})", file=sys.stderr)
         self._closed = True
-        self._lines.put(False)
 
     def _pressed(self) -> None:
         with self._lock:
             controls, self._controls = self._controls, None
         if controls is None:
-            self._lines.put(True)
+            self._presses.put(None)
         else:
             controls.resume()
 

@@ -9,11 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from rig.bench import load_bench
 from rig.library import find_scene
 from rig.scene import Scene
 from rig.session import Request
+
+settings.register_profile("same", derandomize=True)
+settings.register_profile("explore", derandomize=False, print_blob=True)
+settings.load_profile("same")
 
 SHORT = {"preload_dwell_s": 1.0, "tare_s": 0.5, "retract_speed_um_s": 100.0, "preload_N": 0.3}
 

@@ -53,15 +53,34 @@ def test_only_a_prompt_is_answered(line):
     assert controls.take() is Wish.NONE
 
 
-def test_between_runs_the_program_waits_for_enter(line, capsys):
+def test_between_runs_the_program_waits_for_enter(line, monkeypatch):
     keyboard, press = line
-    press.write("\n")
+
+    class Terminal(io.StringIO):
+        """Presses Enter once and hangs up, when the question is on the screen."""
+
+        def flush(self):
+            if not press.closed:
+                press.write("\n")
+                press.close()
+
+    monkeypatch.setattr("sys.stderr", terminal := Terminal())
+    keyboard.confirm("Mount the 60 mm sphere.")
+    assert terminal.getvalue() == "Mount the 60 mm sphere. Press Enter to go on. "
+    with pytest.raises(Refused, match="Mount the flat"):
+        keyboard.confirm("Mount the flat.")
+
+
+def test_an_enter_pressed_before_the_question_does_not_answer_it(line):
+    keyboard, press = line
+    press.write("\n\n")
+    press.close()
     keyboard.answer_for(controls := Controls())
     assert taken(controls) is Wish.RESUME
-    press.write("\n")
-    press.close()
-    keyboard.confirm("Mount the 60 mm sphere.")
-    assert "Mount the 60 mm sphere. Press Enter to go on." in capsys.readouterr().err
+    while keyboard.answer_for(controls):
+        time.sleep(0.001)
+    with pytest.raises(Refused, match="Nobody can answer"):
+        keyboard.confirm("Mount the 60 mm sphere.")
 
 
 def test_a_closed_keyboard_refuses_and_names_the_console(capsys):

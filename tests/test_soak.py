@@ -6,6 +6,8 @@ import gc
 import os
 import random
 import threading
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import psutil
 import pytest
@@ -52,27 +54,37 @@ def random_run(number: int, folder, *, wire: bool) -> None:
     request.out.unlink()
 
 
-def soak(runs: int, folder, *, wire: bool) -> dict[str, tuple[float, float]]:
-    """Run so many; return memory (MB), threads and open files after the warm-up and at the end."""
+@dataclass(frozen=True)
+class Usage:
+    """What the process holds after so many runs."""
+
+    runs: int
+    memory_MB: float
+    threads: int
+    open_files: int
+
+
+def usage(runs: int) -> Usage:
+    gc.collect()
     process = psutil.Process()
-    open_files = process.num_handles if psutil.WINDOWS else process.num_fds
+    open_files = process.num_handles() if psutil.WINDOWS else process.num_fds()
+    return Usage(runs, process.memory_info().rss / 1e6, threading.active_count(), open_files)
 
-    def usage() -> tuple[float, float, float]:
-        gc.collect()
-        return process.memory_info().rss / 1e6, threading.active_count(), open_files()
 
-    before = usage()
+def soak(runs: int, folder, *, wire: bool) -> Iterator[Usage]:
+    """Run so many; tell what the process holds after the warm-up, then twenty times."""
+    warm = min(WARM_UP, runs // 2)
     for number in range(runs):
         random_run(number, folder, wire=wire)
-        if number == min(WARM_UP, runs // 2):
-            before = usage()
-    return dict(zip(("memory", "threads", "files"), zip(before, usage(), strict=True), strict=True))
+        if number + 1 == warm or (number + 1 > warm and (runs - number - 1) % max(runs // 20, 1) == 0):
+            yield usage(number + 1)
 
 
-def check_growth(grown: dict[str, tuple[float, float]]) -> None:
-    assert grown["threads"][1] <= grown["threads"][0]
-    assert grown["files"][1] <= grown["files"][0]
-    assert grown["memory"][1] < grown["memory"][0] + 50
+def check_growth(usages: Iterable[Usage]) -> None:
+    first, *_, last = usages
+    assert last.threads <= first.threads
+    assert last.open_files <= first.open_files
+    assert last.memory_MB < first.memory_MB + 50
 
 
 def test_some_random_runs_leave_nothing_behind(tmp_path):
