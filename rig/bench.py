@@ -18,7 +18,10 @@ EMULATED = "emulated"
 
 
 class StageSection(Section):
-    """``[stage]``: PI controller with a linear stage."""
+    """``[stage]``: PI controller with a linear stage.
+
+    ``left_on`` is for an emulated one: it has kept its reference and stands at ``start_mm`` (a real one is asked).
+    """
 
     connection: str
     model: str = "C-863"
@@ -29,12 +32,19 @@ class StageSection(Section):
     maximum_mm: float
     start_mm: float | None = None
     reference_on_start: bool = False
+    left_on: bool = False
     reply_timeout_ms: Annotated[float, Field(ge=20, le=5000)] = 400.0
 
     @model_validator(mode="after")
     def _has_travel(self) -> StageSection:
         if self.minimum_mm >= self.maximum_mm:
             raise ValueError(f"minimum_mm = {self.minimum_mm:g} must lie below maximum_mm = {self.maximum_mm:g}")
+        return self
+
+    @model_validator(mode="after")
+    def _was_left_on_somewhere(self) -> StageSection:
+        if self.left_on and (self.connection != EMULATED or self.start_mm is None):
+            raise ValueError("left_on is for an emulated stage that has a start_mm; a real stage is asked")
         return self
 
 

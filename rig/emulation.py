@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rig.observe import Controls, Event, Watcher
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from drivers.emulated.bench import EmulatedBench
     from drivers.emulated.electronics import Device
     from drivers.emulated.truth import Truth
-    from rig.bench import Bench
+    from rig.bench import Bench, StageSection
     from rig.scene import Scene
     from rig.session import Request
 
@@ -22,15 +23,22 @@ def emulated_bench(request: Request) -> EmulatedBench:
     from drivers.emulated.bench import EmulatedBench
 
     return EmulatedBench(
-        truth(request.scene, request.seed),
+        _left_on(truth(request.scene, request.seed), request.bench.stage),
         seed=request.seed,
         speed=request.speed,
         faults=request.faults,
-        referenced=request.referenced,
+        referenced=request.referenced or request.bench.stage.left_on,
         wire=request.wire,
         pressure=request.scene.uses_pressure,
         device=_device(request.bench),
     )
+
+
+def _left_on(world: Truth, stage: StageSection) -> Truth:
+    """Return the world with its stage where the bench says that it was left."""
+    if not stage.left_on or stage.start_mm is None:
+        return world
+    return replace(world, train=replace(world.train, start_position=stage.start_mm * 1e-3))
 
 
 def truth(scene: Scene, seed: int) -> Truth:

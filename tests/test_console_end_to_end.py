@@ -56,7 +56,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "scene.toml").write_text(SCENE)
     _, bench = load_bench(None)
     patient = bench.replace("[limits]", "[limits]\nlag_s = 4.0")  # a busy machine is no fault of this test
-    patient = patient.replace("start_mm = 22.0", "start_mm = 20.1")
+    patient = patient.replace("start_mm = 22.0", "start_mm = 20.1\nleft_on = true")
     (tmp_path / "bench.toml").write_text(patient)
     return tmp_path
 
@@ -233,6 +233,7 @@ application.exec()
 def test_replay_in_the_window(place: Path) -> None:
     """A recorded run comes back through the loop into the console's own process."""
     words = [sys.executable, "-m", "rig", "run", "scene.toml", "--direct", "--no-picture", "--out", "one.h5"]
+    words += ["--bench", "bench.toml"]
     subprocess.run(words, check=True, capture_output=True)
     script = Path(__file__).with_name("replay_script.py")
     done = subprocess.run(

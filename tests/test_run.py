@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.emulated.faults import Fault, Faults
+from rig.bench import parse_bench
 from rig.errors import FileError, Refused
 from rig.observe import Controls, StepPhase, Watcher
 from rig.recording import load_recording, load_run
@@ -49,6 +50,15 @@ def test_the_wire_and_the_direct_back_end_record_the_same(request_for, tmp_path)
         assert run_scene(request_for(wire=wire, out=tmp_path / name)).exit_code == 0
     for ours, theirs in zip(raw(tmp_path / "wire.h5"), raw(tmp_path / "direct.h5"), strict=True):
         assert np.array_equal(ours, theirs)
+
+
+def test_an_emulated_stage_that_was_left_on_starts_without_seeking_its_switch(request_for):
+    request = request_for()
+    text = request.bench_text.replace("start_mm = 22.0", "start_mm = 20.3\nleft_on = true")
+    text = text.replace("reference_on_start = true", "reference_on_start = false")
+    request = dataclasses.replace(request, bench=parse_bench(text, "bench.toml"), bench_text=text)
+    assert run_scene(request).exit_code == 0
+    assert load_run(request.out).height[0] == pytest.approx(20.3e-3, abs=1e-6)
 
 
 def test_one_seed_is_one_run_and_another_is_another(request_for, tmp_path):

@@ -94,3 +94,12 @@ def test_any_text_is_a_scene_or_one_clear_error(text):
             parse(text, "fuzz.toml")
         except FileError as error:
             assert "fuzz.toml" in str(error)
+
+
+def test_only_an_emulated_stage_can_be_said_to_have_been_left_on():
+    _, emulated = load_bench(None)
+    left_on = emulated.replace("start_mm = 22.0", "start_mm = 20.1\nleft_on = true")
+    assert parse_bench(left_on, "bench.toml").stage.left_on
+    real = left_on.replace('[stage]\nconnection = "emulated"', '[stage]\nconnection = "/dev/ttyUSB0"')
+    with pytest.raises(FileError, match=r"bench\.toml.*left_on is for an emulated stage"):
+        parse_bench(real, "bench.toml")
