@@ -13,6 +13,10 @@ class FileError(RigError):
     exit_code = 2
 
 
+class BeingWritten(FileError):
+    """A recording cannot be repaired while a program still writes it."""
+
+
 class Interlock(RigError):
     """A limit was passed; everything has been stopped."""
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analysis.run import Run, Sensors, Step
 from rig.bench import Bench, parse_bench
-from rig.errors import FileError
+from rig.errors import BeingWritten, FileError
 from rig.journal import journal_of, read_journal, sync, sync_folder
 from rig.observe import StepPhase
 from rig.recorder import ENDING, EVENTS, FORMAT, FRAMES, PREDICTIONS, PUMP, STAGE, STEPS, extend, lay_out
@@ -59,20 +59,10 @@ def open_recording(path: Path) -> Iterator[h5py.Group]:
     """
     _insist(path)
     if not is_sealed(path):
-        _mend(path)
+        with suppress(BeingWritten):
+            recover(path)
     with _opened(path) as file:
         yield _entry(file, path)
-
-
-def _mend(path: Path) -> None:
-    """Repair what a crash has left; a recording that is still being written stays as it is."""
-    if _rewritten(path, force=False) is not None:
-        return
-    probe(path)
-    with _opened(path) as file:
-        dead = file.swmr_mode and not _writer_lives(file)
-    if dead:
-        _repair(path)
 
 
 def read_through(path: Path) -> None:
@@ -91,7 +81,9 @@ def recover(path: Path, *, force: bool = False) -> Recovery:
     Raises
     ------
     FileError
-        The file cannot be read at all, or the program that writes it is still running (``force`` overrides).
+        The file cannot be read at all.
+    BeingWritten
+        The program that writes it is still running (``force`` overrides).
     """
     _insist(path)
     if not is_sealed(path):
@@ -101,9 +93,10 @@ def recover(path: Path, *, force: bool = False) -> Recovery:
         probe(path)
     with _opened(path) as file:
         if file.swmr_mode and not force and _writer_lives(file):
-            raise FileError(f"recording {path}: is still being written. Remedy: wait for the run to end.")
+            raise BeingWritten(f"recording {path}: is still being written. Remedy: wait for the run to end.")
         if not file.swmr_mode:
-            return Recovery(path, *_complete(_entry(file, path)), repaired=False)
+            with _reading(path):
+                return Recovery(path, *_complete(_entry(file, path)), repaired=False)
     return _repair(path)
 
 
@@ -292,12 +285,17 @@ def sensors(bench: Bench) -> Sensors:
 
 
 def _load(entry: h5py.Group, path: Path) -> Recording:
-    try:
+    with _reading(path):
         _check_sizes(entry, path)
         _check_kinds(entry)
         return _read(entry, path)
-    except FileError:
-        raise
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes h5py and NumPy raise into a ``FileError`` that names it."""
+    try:
+        yield
     except (LookupError, ValueError, OSError, RuntimeError, TypeError, AttributeError, MemoryError) as error:
         raise FileError(
             f"recording {path}: incomplete or damaged ({error}). Remedy: try `rig recover`; "

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from rig.errors import FileError
+from rig.errors import BeingWritten, FileError
 from rig.recording import load_recording, open_recording, recover
 from rig.session import run_scene
 
@@ -49,7 +49,7 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(tmp_path):
             with h5py.File(path, "r", swmr=True, libver="latest") as file:
                 with_data = file["entry/data/force"].shape[0] if "entry" in file else 0
                 volts = file["entry/raw/volts"][: with_data - 20] if with_data else None
-        with pytest.raises(FileError, match="still being written"):
+        with pytest.raises(BeingWritten, match="Remedy: wait"):
             recover(path)
         writer.kill()
         writer.communicate()
