@@ -10,7 +10,6 @@ import hashlib
 import json
 import os
 import random
-import re
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,20 +17,25 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tomlkit
 from pydantic import Field, ValidationError
 
 from rig.errors import FileError
 from rig.library import find_scene
-from rig.scene import Scene, Section, parse_scene, read_text
+from rig.scene import Scene, Section, Title, parse_scene, read_text
 from rig.validation import explain
 
 JOURNAL = "journal.jsonl"
 
 
 class EntrySection(Section):
-    """``[[test]]``: a scene, the pressures it is run at, how often, and what the operator has to do before."""
+    """``[[test]]``: a scene, the pressures it is run at, how often, and what the operator has to do before.
+
+    ``name`` (by default the scene's) names recordings and titles of tests at other pressures than the scene's.
+    """
 
     scene: str
+    name: Title | None = None
     initial_pressures_kPa: Annotated[tuple[float, ...], Field(min_length=1, strict=False)] | None = None
     repeats: Annotated[int, Field(ge=1, le=1000)] | None = None
     prompt: str = ""
@@ -117,30 +121,25 @@ def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
         text, source = find_scene(str(beside) if beside.suffix and beside.exists() else section.scene)
         scene = parse_scene(text, source)
         repeats = section.repeats or campaign.repeats
-        for pressure in section.initial_pressures_kPa or (None,):
-            stem = f"{number + 1:02d}-{Path(source).stem}"
-            if pressure is None:
-                yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt)
-                continue
-            stem = f"{re.sub('-(high|low|vented)$', '', stem)}_{pressure:+g}kPa"
-            changed, changed_text = _at_pressure(text, pressure, f"{source} at {pressure:g} kPa")
-            yield from _places(changed, changed_text, stem, repeats, campaign.seed, section.prompt)
+        name = section.name or Path(source).stem
+        stem = f"{number + 1:02d}-{_word(name)}"
+        if section.initial_pressures_kPa is None:
+            yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt)
+            continue
+        for pressure in section.initial_pressures_kPa:
+            changed, changed_text = _at_pressure(text, name, pressure, f"{source} at {pressure:g} kPa")
+            yield from _places(
+                changed, changed_text, f"{stem}_{pressure:+g}kPa", repeats, campaign.seed, section.prompt
+            )
 
 
-def _at_pressure(text: str, pressure: float, source: str) -> tuple[Scene, str]:
+def _at_pressure(text: str, name: str, pressure: float, source: str) -> tuple[Scene, str]:
     """Return scene and text at another pressure; what is recorded is what is run, in its title too."""
-    lines = [line for line in text.splitlines() if not re.match(r"\s*initial_pressure_kPa\s*=", line)]
-    lines = [
-        re.sub(r"[-+]?\d+(\.\d+)? kPa", f"{pressure:+g} kPa", line) if re.match(r"\s*title\s*=", line) else line
-        for line in lines
-    ]
-    place = next((i for i, line in enumerate(lines) if re.match(r"\s*\[\s*protocol\s*\]", line)), None)
-    if place is None:
-        lines += ["", "[protocol]", 'name = "pull_off"']
-        place = len(lines) - 2
-    lines.insert(place + 1, f"initial_pressure_kPa = {pressure!r}")
-    changed = "\n".join(lines) + "\n"
-    return parse_scene(changed, source), changed
+    changed = tomlkit.parse(text)
+    changed["title"] = f"{name} at {pressure:+g} kPa"
+    changed.setdefault("protocol", {"name": "pull_off"})["initial_pressure_kPa"] = pressure
+    changed_text = tomlkit.dumps(changed)
+    return parse_scene(changed_text, source), changed_text
 
 
 def _places(scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str) -> Iterator[PlannedTest]:
@@ -165,7 +164,7 @@ def _places(scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt:
 
 
 def _word(place: str) -> str:
-    return "".join(letter if letter.isalnum() else "_" for letter in place)
+    return "".join(letter if letter.isalnum() or letter == "-" else "_" for letter in place)
 
 
 def _ordered(campaign: Campaign, tests: list[PlannedTest]) -> Iterator[PlannedTest]:

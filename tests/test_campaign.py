@@ -214,12 +214,19 @@ def test_a_recording_of_another_scene_is_not_adopted(tmp_path, campaign):
     assert all(("~2" in name) == ("zero" in key) for key, name in recordings.items())
 
 
-def test_the_pressure_of_a_test_is_in_its_scene_whatever_the_scene_looks_like(tmp_path):
-    text = scene_text("sphere-60mm-low").replace("[protocol]", "  [ protocol ]  # as mounted")
-    (tmp_path / "s.toml").write_text(text.replace("initial_pressure_kPa", "  initial_pressure_kPa"), "utf-8")
+@pytest.mark.parametrize(
+    "protocol",
+    ["  [ protocol ]  # as mounted\n  {keys}", "[protocol]\n{keys}", "protocol.{keys}", "protocol = {{ {keys} }}", ""],
+)
+def test_the_pressure_of_a_test_is_in_its_scene_whatever_the_scene_looks_like(tmp_path, protocol):
+    head = 'title = "initial_pressure_kPa = 1"\n{}\n[substrate]\nshape = "flat" # glass\n{}\n'
+    text = protocol.format(keys="initial_pressure_kPa = -3.2")
+    (tmp_path / "s.toml").write_text(head.format("", text) if "[" in text else head.format(text, ""), "utf-8")
     (tmp_path / "c.toml").write_text(
-        'title = "c"\n[[test]]\nscene = "s.toml"\ninitial_pressures_kPa = [-1.5, 0.5]\n', "utf-8"
+        'title = "c"\n[[test]]\nscene = "s.toml"\nname = "glass"\ninitial_pressures_kPa = [-1.5, 0.5]\n', "utf-8"
     )
     _, tests = load_campaign(tmp_path / "c.toml")
     assert [test.scene.protocol.initial_pressure_kPa for test in tests] == [-1.5, 0.5]
-    assert all(parse_scene(test.scene_text, "again") == test.scene for test in tests)
+    assert [test.key for test in tests] == ["01-glass_-1.5kPa", "01-glass_+0.5kPa"]
+    assert [test.scene.title for test in tests] == ["glass at -1.5 kPa", "glass at +0.5 kPa"]
+    assert all(parse_scene(test.scene_text, "again") == test.scene and "# glass" in test.scene_text for test in tests)
