@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import accumulate
 
-from rig.bench import Bench
+from rig.bench import Bench, PumpSection
 from rig.errors import Refused
 from rig.scene import (
     ComplianceSection,
@@ -40,10 +40,25 @@ def check(scene: Scene, bench: Bench) -> None:
     Refused
         Names every reason with value, limit and remedy.
     """
+    found = reasons(scene, bench)
+    if found:
+        raise Refused(f"scene {scene.title!r} cannot run on bench {bench.title!r}: " + "; ".join(found))
+
+
+def reasons(scene: Scene, bench: Bench) -> list[str]:
+    """Return why the bench cannot carry out the scene, each with value, limit and remedy; empty if it can."""
     parts = (_instruments, _forces, _resolution, _tension, _pressure, _strokes, _speeds, _overruns)
-    reasons = [reason for part in parts for reason in part(scene, bench)]
-    if reasons:
-        raise Refused(f"scene {scene.title!r} cannot run on bench {bench.title!r}: " + "; ".join(reasons))
+    return [reason for part in parts for reason in part(scene, bench)]
+
+
+def usable_ml(pump: PumpSection) -> float:
+    """Return how much of the syringe can be used, ml: its ends are left alone."""
+    return 0.8 * pump.syringe_volume_ml
+
+
+def needed_ml(scene: Scene, pressure_kPa: float) -> float:
+    """Return what the pump has to move for a pressure in the scene's chamber, ml (Boyle)."""
+    return scene.gripper.chamber_volume_ml * abs(pressure_kPa) / (scene.gas.atmospheric_pressure_kPa + pressure_kPa)
 
 
 def _instruments(scene: Scene, bench: Bench) -> list[str]:
@@ -116,21 +131,20 @@ def _strokes(scene: Scene, bench: Bench) -> list[str]:
     if not isinstance(protocol, VolumeSection) or bench.pump is None:
         return []
     pumped = list(accumulate(protocol.strokes_ml))
-    reasons = []
-    reach = max(0.0, *pumped) - min(0.0, *pumped)
-    if reach > 0.8 * bench.pump.syringe_volume_ml:
-        available = 0.8 * bench.pump.syringe_volume_ml
-        reasons.append(f"strokes_ml: they span {reach:g} ml, {available:g} ml of the syringe can be used; shorten them")
+    found = []
+    reach, available = max(0.0, *pumped) - min(0.0, *pumped), usable_ml(bench.pump)
+    if reach > available:
+        found.append(f"strokes_ml: they span {reach:g} ml, {available:g} ml of the syringe can be used; shorten them")
     volume, atmosphere = scene.gripper.chamber_volume_ml, scene.gas.atmospheric_pressure_kPa
     low, high = bench.limits.pressure_low_kPa, bench.limits.pressure_high_kPa
     for amount in pumped:
         pressure = atmosphere * amount / (volume - amount) if amount < volume else float("inf")
         if not low <= pressure <= high:
-            reasons.append(
+            found.append(
                 f"strokes_ml: {amount:+g} ml in the chamber make about {pressure:+.3g} kPa, the bench allows {low:g} "
                 f"to {high:g} kPa; shorten the strokes"
             )
-    return reasons
+    return found
 
 
 def _pressure(scene: Scene, bench: Bench) -> list[str]:
@@ -139,18 +153,18 @@ def _pressure(scene: Scene, bench: Bench) -> list[str]:
     if pressure is None or bench.pump is None:
         return []
     low, high = bench.limits.pressure_low_kPa, bench.limits.pressure_high_kPa
-    reasons = []
+    found = []
     if not low <= pressure <= high:
-        reasons.append(f"initial_pressure_kPa = {pressure:g} lies outside the bench's {low:g} to {high:g} kPa")
-    atmosphere = scene.gas.atmospheric_pressure_kPa
-    needed = scene.gripper.chamber_volume_ml * abs(pressure) / (atmosphere + pressure)
-    available = 0.8 * bench.pump.syringe_volume_ml
+        found.append(
+            f"initial_pressure_kPa = {pressure:g} lies outside the bench's {low:g} to {high:g} kPa; choose one within"
+        )
+    needed, available = needed_ml(scene, pressure), usable_ml(bench.pump)
     if needed > available:
-        reasons.append(
+        found.append(
             f"reaching {pressure:g} kPa takes about {needed:.2f} ml, {available:g} ml of the syringe can be used; "
             "fit a larger syringe"
         )
-    return reasons
+    return found
 
 
 def _speeds(scene: Scene, bench: Bench) -> list[str]:
@@ -159,7 +173,7 @@ def _speeds(scene: Scene, bench: Bench) -> list[str]:
     keys = ("approach_speed_um_s", "retract_speed_um_s")
     return [
         f"{key} = {speed:g} is too fast for a look-ahead of {bench.limits.look_ahead_um:g} um in frames of "
-        f"{bench.daq.frame_ms:g} ms (at most {fastest:g} um/s)"
+        f"{bench.daq.frame_ms:g} ms (at most {fastest:g} um/s); lower it, shorten frame_ms or lengthen look_ahead_um"
         for key in keys
         if (speed := getattr(scene.protocol, key, 0.0)) > fastest
     ]
@@ -189,7 +203,7 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
         "lower compression_N or shorten frame_ms": (overload - bench.limits.compression_N) * compliance / reaction,
         "lower preload_N or shorten lag_s": (overload - preload) * compliance / late,
     }
-    reasons = [
+    found = [
         f"approach_speed_um_s = {speed:g} can overload the load cell, whose force rises by 1 N in {compliance:g} um "
         f"(at most {most:.3g} um/s); approach more slowly, {remedy}"
         for remedy, most in fastest.items()
@@ -197,8 +211,8 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
     ]
     furthest = (overload - preload) * compliance
     if bench.limits.look_ahead_um > furthest:
-        reasons.append(
+        found.append(
             f"look_ahead_um = {bench.limits.look_ahead_um:g} would overload the load cell if this computer died at the "
             f"preload (at most {furthest:.3g} um); shorten it"
         )
-    return reasons
+    return found

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from rig.bench import Bench, load_bench
-from rig.check import check
-from rig.errors import Refused, RigError
+from rig.check import needed_ml, reasons, usable_ml
+from rig.errors import RigError
 from rig.library import find_scene
 from rig.protocols import build_steps
 from rig.scene import Scene, parse_scene
@@ -40,21 +40,14 @@ def check_scene(name: str, bench_path: Path | None) -> Checked:
         bench, _ = load_bench(bench_path)
     except RigError as error:
         return Checked(None, True, (), (str(error),))
-    try:
-        check(scene, bench)
-    except Refused as error:
-        return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), _reasons(error))
-    return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), (), _plan(scene))
+    return Checked(
+        scene, bench.is_emulated, tuple(_findings(scene, bench)), tuple(reasons(scene, bench)), _plan(scene)
+    )
 
 
 def _plan(scene: Scene) -> tuple[str, ...]:
     """Return the names of the steps; planning touches no instrument, so none is given."""
     return tuple(step.name for step in build_steps(scene, cast("Apparatus", None)))
-
-
-def _reasons(error: Refused) -> tuple[str, ...]:
-    _, _, reasons = str(error).partition(": ")
-    return tuple((reasons or str(error)).split("; "))
 
 
 def _findings(scene: Scene, bench: Bench) -> list[str]:
@@ -70,9 +63,8 @@ def _findings(scene: Scene, bench: Bench) -> list[str]:
         found.append(f"preload {preload:g} N of {min(limits.compression_N, bench.force.capacity_N):g} N")
     pressure = getattr(protocol, "initial_pressure_kPa", None)
     if pressure is not None and bench.pump is not None:
-        needed = scene.gripper.chamber_volume_ml * abs(pressure) / (scene.gas.atmospheric_pressure_kPa + pressure)
         found.append(
             f"P\u2080 {pressure:g} kPa within {limits.pressure_low_kPa:g} to {limits.pressure_high_kPa:g} kPa; "
-            f"syringe: {needed:.2f} of {bench.pump.syringe_volume_ml / 2:g} ml"
+            f"syringe: {needed_ml(scene, pressure):.2f} of {usable_ml(bench.pump):g} ml"
         )
     return found
