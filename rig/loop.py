@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import SensorFault
+from drivers.errors import DeviceError, SensorFault
 from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage, StageStatus
 from rig.errors import Interlock, StoppedByOperator
 from rig.interlocks import Interlocks
@@ -244,7 +244,7 @@ class Loop:
             self._converter.check()
             self._interlocks.check_signals(force, pressure)
         except (Interlock, SensorFault):
-            self._instruments.stage.emergency_stop()
+            self._stop_at_once()
             self.interlock_latency = time.perf_counter() - began
             self._keep_last(volts, force, pressure)
             raise
@@ -263,8 +263,19 @@ class Loop:
         height = timebase.place(frame.start, frame.force.size, arrived, frame.stage)
         self._record(frame, height, arrived)
         lag = timebase.lag(frame.stop, arrived)
-        self._interlocks.check_motion(frame.stage, lag)
+        try:
+            self._interlocks.check_motion(frame.stage, lag)
+        except Interlock:
+            self._stop_at_once()
+            raise
         return lag
+
+    def _stop_at_once(self) -> None:
+        """Send the stop byte; where that fails the limit stays what ended the run, and the safe state tries again."""
+        try:
+            self._instruments.stage.emergency_stop()
+        except DeviceError as error:
+            self._reporter.event("fault", str(error))
 
     def _record(self, frame: Frame, height: Array, arrived: float) -> None:
         if self._store is not None:

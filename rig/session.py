@@ -21,7 +21,7 @@ from drivers.errors import DeviceError
 from rig.bench import Bench
 from rig.check import check
 from rig.commanded import CommandedPump, CommandedStage
-from rig.errors import FileError, Refused, RigError
+from rig.errors import FileError, Interlock, Refused, RigError
 from rig.instruments import Opened, open_instruments
 from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
@@ -161,7 +161,7 @@ def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
     try:
         loop.run(play(steps, reporter))
     except _REPORTED as error:
-        kind = "interlock" if loop.interlock_latency is not None else "fault"
+        kind = "interlock" if isinstance(error, Interlock) else "fault"
         where = "" if f"step {reporter.step}" in str(error) else f" (in step {reporter.step})"
         reporter.event(kind, f"{error}{where}")
         if loop.interlock_latency is not None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.emulated.faults import Fault, Faults
+from drivers.errors import NotConnected
 from rig.bench import parse_bench
 from rig.errors import FileError, Refused
 from rig.observe import Controls, StepPhase, Watcher
@@ -163,6 +164,38 @@ def test_force_over_the_limit_stops_the_stage_and_keeps_the_recording(request_fo
     recording = load_recording(request.out)
     assert recording.force.size == ending.samples
     assert replay(recording, pace=Pace()).differences == ()
+
+
+def test_a_stop_byte_that_cannot_be_sent_does_not_hide_the_limit_nor_lose_the_frame(request_for, monkeypatch):
+    def unplugged(stage):
+        raise NotConnected("stage", "the stop could not be sent", "check the cable")
+
+    monkeypatch.setattr("drivers.emulated.direct.DirectStage.emergency_stop", unplugged)
+    faults = Faults([Fault("force", "over_range", at_step="preload", after_samples=100, value=4.7)])
+    request = request_for(faults=faults)
+    ending = run_scene(request)
+    assert ending.exit_code == 3
+    assert "force +4.7" in ending.reason
+    recording = load_recording(request.out)
+    assert recording.force[-1] > request.bench.limits.compression_N
+    told = [(row["kind"], row["text"]) for row in recording.events if row["kind"] in (b"fault", b"interlock")]
+    assert [kind for kind, _ in told] == [b"fault", b"interlock"]
+    assert b"the stop could not be sent" in told[0][1]
+
+
+def test_a_limit_of_time_stops_the_stage_and_is_told_as_an_interlock(request_for, monkeypatch):
+    pressed = []
+
+    def press(stage):
+        pressed.append(stage)
+
+    monkeypatch.setattr("drivers.emulated.direct.DirectStage.emergency_stop", press)
+    monkeypatch.setattr("rig.timebase.TimeBase.lag", lambda *_: 9.0)
+    request = request_for(referenced=True)
+    ending = run_scene(request)
+    assert (ending.exit_code, len(pressed)) == (3, 1)
+    recording = load_recording(request.out)
+    assert [row["kind"] for row in recording.events if b"late" in row["text"]] == [b"interlock", b"end"]
 
 
 def test_an_observer_that_fails_harms_nothing(request_for):

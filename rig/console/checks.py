@@ -40,9 +40,7 @@ def check_scene(name: str, bench_path: Path | None) -> Checked:
         bench, _ = load_bench(bench_path)
     except RigError as error:
         return Checked(None, True, (), (str(error),))
-    return Checked(
-        scene, bench.is_emulated, tuple(_findings(scene, bench)), tuple(reasons(scene, bench)), _plan(scene)
-    )
+    return Checked(scene, bench.is_emulated, tuple(_findings(scene, bench)), tuple(reasons(scene, bench)), _plan(scene))
 
 
 def _plan(scene: Scene) -> tuple[str, ...]:
