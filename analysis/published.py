@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from analysis.intervals import Interval, as_printed, decimals, mean
+from model import Gas, Parameters, Substrate
 
 EFFECTIVE_RADIUS_CM = "0.73"
 """r_e of the rigid system, cm (SI section S3)."""
@@ -52,6 +53,65 @@ TABLE_S2 = (
     Characterization("Flat Glass", "2.5", "1.7", "-51.7", "0.66", "3.61", "5.4", "2.6", "14.2", "3.6", "19.5"),
     Characterization("Rubber Film", "2.5", "0.3", "-50.9", "0.08", "0.61", "7.2", "0.3", "2.4", None, None),
 )
+
+
+DISTANCES = {
+    ("d_b 15 mm", "2.0"): ("2.48", "1.7"),
+    ("d_b 15 mm", "-0.7"): ("2.21", None),
+    ("d_b 60 mm", "1.6"): ("2.24", "1.0"),
+    ("d_b 60 mm", "-3.2"): ("1.14", None),
+}
+"""D_p and z_r at F_p in mm by column and pressure of Table S1, where the text of EML gives them (section 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """One pull-off test of the rigid gripper; ``None`` where nothing is printed.
+
+    Attributes
+    ----------
+    substrate
+        Its column of Table S1.
+    diameter
+        d_b, m; ``None`` for the flat.
+    pressure, force
+        P_0, Pa gauge, and F_p, N.
+    distance, retraction_at_force
+        D_p and z_r at F_p, m.
+    """
+
+    substrate: str
+    diameter: float | None
+    pressure: float
+    force: float
+    distance: float | None
+    retraction_at_force: float | None
+
+    @property
+    def parameters(self) -> Parameters:
+        """The scene with the nominal values of EML."""
+        shape = Substrate("flat") if self.diameter is None else Substrate("sphere", self.diameter)
+        return Parameters(shape, gas=Gas(self.pressure))
+
+
+def experiments() -> list[Experiment]:
+    """Return the eight tests of Table S1, each substrate at its highest pressure and then at its lowest."""
+    return [
+        _experiment(column.substrate, pressure, force)
+        for column in TABLE_S1
+        for pressure, force in (
+            (column.highest_pressure, column.least_force),
+            (column.lowest_pressure, column.largest_force),
+        )
+    ]
+
+
+def _experiment(substrate: str, pressure: str, force: str) -> Experiment:
+    diameter = None if substrate.startswith("Flat") else float(substrate.split()[1]) * 1e-3
+    distance, at_force = (
+        None if text is None else float(text) * 1e-3 for text in DISTANCES.get((substrate, pressure), (None, None))
+    )
+    return Experiment(substrate, diameter, float(pressure) * 1e3, float(force), distance, at_force)
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analysis.accuracy.report import markdown
-from analysis.published import TABLE_S1
-from model import Gas, GasAnchor, Parameters, Substrate, membrane, predict
+from analysis.published import Experiment, experiments
+from model import GasAnchor, Parameters, membrane, predict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,25 +19,7 @@ if TYPE_CHECKING:
     from model.prediction import Prediction
 
 
-@dataclass(frozen=True, slots=True)
-class Experiment:
-    """One published test: force of Table S1; distances of EML section 3, where the text gives them."""
-
-    substrate: str
-    diameter: float | None
-    pressure: float
-    force: float
-    distance: float | None = None
-    distance_at_force: float | None = None
-
-    @property
-    def parameters(self) -> Parameters:
-        """The scene with the nominal values of EML."""
-        shape = Substrate("flat") if self.diameter is None else Substrate("sphere", self.diameter)
-        return Parameters(shape, gas=Gas(self.pressure))
-
-
-MODELS = {
+VARIANTS = {
     "cone-2017": ("cone-2017", None),
     "cone": ("cone", None),
     "membrane, eml": ("membrane", "eml"),
@@ -46,15 +28,7 @@ MODELS = {
     "membrane, frictionless": ("membrane", "frictionless"),
     "membrane, unstretched": ("membrane", "unstretched"),
 }
-"""Models by the name of the table: model and contact stretch."""
-
-DISTANCES = {
-    ("d_b 60 mm", "highest"): (2.24, 1.0),
-    ("d_b 60 mm", "lowest"): (1.14, None),
-    ("d_b 15 mm", "highest"): (2.48, 1.7),
-    ("d_b 15 mm", "lowest"): (2.21, None),
-}
-"""D_p and z_r at F_p in mm, EML section 3."""
+"""What is compared, by its name in the tables: model and contact stretch."""
 
 IMPLIED_AT_30_MM = 2.8
 """EML: the cone's D_p at 30 mm and the lowest pressure is 2.8 times the experiment's; no value is printed."""
@@ -89,40 +63,11 @@ TRIED: dict[str, Callable[[Parameters], Parameters]] = {
 """What was changed in search of the discrepancies, one at a time."""
 
 
-def experiments() -> list[Experiment]:
-    """Return the eight tests of Table S1 with the distances that EML's text adds."""
-    found = []
-    for column in TABLE_S1:
-        name = column.substrate
-        diameter = None if name.startswith("Flat") else float(name.split()[1]) * 1e-3
-        for which, pressure, force in (
-            ("highest", column.highest_pressure, column.least_force),
-            ("lowest", column.lowest_pressure, column.largest_force),
-        ):
-            distance, at_force = DISTANCES.get((name, which), (None, None))
-            found.append(
-                Experiment(
-                    name,
-                    diameter,
-                    float(pressure) * 1e3,
-                    float(force),
-                    None if distance is None else distance * 1e-3,
-                    None if at_force is None else at_force * 1e-3,
-                )
-            )
-    return found
-
-
 def predictions() -> dict[str, list[Prediction]]:
     """Return the predictions of every model for every experiment."""
     return {
-        name: [
-            predict(test.parameters, model, points=150)
-            if stretch is None
-            else predict(test.parameters, model, points=150, contact_stretch=stretch)
-            for test in experiments()
-        ]
-        for name, (model, stretch) in MODELS.items()
+        name: [predict(test.parameters, model, points=150, contact_stretch=stretch) for test in experiments()]
+        for name, (model, stretch) in VARIANTS.items()
     }
 
 

@@ -21,13 +21,12 @@ import numpy as np
 
 from drivers.emulated.plant import Plant
 from drivers.emulated.truth import Truth
-from rig.console.app import shipped_scenes
 from rig.emulation import truth as specimen_of
-from rig.library import find_scene
+from rig.library import load_scene, shipped
 from rig.live import LivePrediction, LivePredictor
 from rig.live_data import Evidence, Gathering, Glance
 from rig.observe import StepEvent, StepPhase
-from rig.scene import Scene, parse_scene
+from rig.scene import Scene
 
 PARTS = (0.0, 0.25, 0.5, 0.75, 0.9)
 RATE = 1000.0
@@ -168,10 +167,10 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=10_000)
     parser.add_argument("--out", type=Path)
     told = parser.parse_args()
-    scenes, tests, began = [s for s in shipped_scenes() if is_pull_off(s)], [], time.perf_counter()
+    scenes, tests, began = [s for s in shipped("scene") if is_pull_off(s)], [], time.perf_counter()
     for number in range(told.tests):
         name, seed = scenes[number % len(scenes)], told.first_seed + number
-        scene = parse_scene(*find_scene(name))
+        scene, _ = load_scene(name)
         evidence = play(scene, wide_truth(scene, seed), seed)
         tests.append({"scene": name, "seed": seed, **judge(scene, evidence)})
         if (number + 1) % 30 == 0:
@@ -185,7 +184,7 @@ def main() -> None:
 
 
 def is_pull_off(name: str) -> bool:
-    scene = parse_scene(*find_scene(name))
+    scene, _ = load_scene(name)
     return scene.protocol.name == "pull_off" and scene.gripper.kind == "rigid" and name.startswith(("flat", "sphere"))
 
 

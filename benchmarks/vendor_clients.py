@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 from rig.emulation import emulated_bench
-from rig.library import find_scene
+from rig.library import load_scene
 from rig.session import Request, run_scene
 
 CLIENTS = ("pipython", "serial", "nidaqmx")
@@ -41,15 +41,12 @@ def keep(request: Request) -> Any:
 def main(scene: str) -> None:
     """Run once and print the lists."""
     from rig.bench import load_bench
-    from rig.scene import parse_scene
 
-    text, source = find_scene(scene)
-    bench, bench_text = load_bench(None)
     sys.modules["rig.emulation"].emulated_bench = keep  # type: ignore[attr-defined]
     with tempfile.TemporaryDirectory() as folder:
         sys.setprofile(watch)
         try:
-            request = Request(parse_scene(text, source), text, bench, bench_text, Path(folder) / "run.h5", live=False)
+            request = Request(*load_scene(scene), *load_bench(None), Path(folder) / "run.h5", live=False)
             ending = run_scene(request)
         finally:
             sys.setprofile(None)

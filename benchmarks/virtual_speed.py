@@ -17,8 +17,7 @@ import rig.loop
 import rig.recorder
 import rig.session
 from rig.bench import load_bench
-from rig.library import find_scene
-from rig.scene import parse_scene
+from rig.library import load_scene
 from rig.session import Request, run_scene
 
 spent: Counter[str] = Counter()
@@ -58,13 +57,12 @@ def instrument_the_rig() -> None:
 
 def measure(scene: str, *, wire: bool, live: bool) -> float:
     """Run once; print the table; return sample time over wall time."""
-    text, source = find_scene(scene)
     bench, bench_text = load_bench(None)
     spent.clear()
     calls.clear()
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run.h5"
-        ending = run_scene(Request(parse_scene(text, source), text, bench, bench_text, out, wire=wire, live=live))
+        ending = run_scene(Request(*load_scene(scene), bench, bench_text, out, wire=wire, live=live))
     frames = calls["daq.read"]
     seconds = frames * bench.daq.frame_ms * 1e-3
     ratio = seconds / spent["loop"]

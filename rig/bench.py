@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import tomllib
 from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from rig.errors import FileError
-from rig.scene import Section, Title, read_text
-from rig.validation import explain
+from rig.library import find
+from rig.scene import Section, Title
+from rig.validation import parsed
 
 EMULATED = "emulated"
 """Connection of an instrument that the program emulates itself."""
+
+OVERLOAD = 1.2
+"""What a load cell survives, in capacities."""
 
 
 class StageSection(Section):
@@ -75,6 +77,10 @@ class DaqSection(Section):
     frame_ms: Annotated[float, Field(ge=1, le=1000)] = 20.0
     allow_remote: bool = False
 
+    def frame_samples(self, rate: float) -> int:
+        """Return how many samples a frame holds at the device's real ``rate``, Hz."""
+        return max(1, round(self.frame_ms * 1e-3 * rate))
+
 
 class CalibrationSection(Section):
     """A calibration record: one line, value = slope * reading + intercept, and where it comes from."""
@@ -117,7 +123,7 @@ class ForceSection(Section):
 
 
 class ZeroSection(Section):
-    """``[pressure.zero]``: the sensor's reading with its port open to the room; ``rig doctor`` measures it."""
+    """``[pressure.zero]``: what the sensor reads open to the room; ``rig run pressure-zero`` measures it."""
 
     offset_Pa: Annotated[float, Field(ge=-1200, le=1200)]
     noise_Pa: Annotated[float, Field(ge=0)]
@@ -168,12 +174,13 @@ class Bench(Section):
 
     @model_validator(mode="after")
     def _cell_is_protected(self) -> Bench:
+        most = OVERLOAD * self.force.capacity_N
         for key in ("compression_N", "tension_N"):
             limit = getattr(self.limits, key)
-            if limit > 1.2 * self.force.capacity_N:
+            if limit > most:
                 raise ValueError(
                     f"limits.{key} = {limit:g} is beyond the load cell: {self.force.cell} carries "
-                    f"{self.force.capacity_N:g} N, at most 120 % of it ({1.2 * self.force.capacity_N:.3g} N) is allowed"
+                    f"{self.force.capacity_N:g} N, at most {100 * OVERLOAD:g} % of it ({most:.3g} N) is allowed"
                 )
         return self
 
@@ -196,32 +203,23 @@ class Bench(Section):
 
 
 def load_bench(path: Path | None) -> tuple[Bench, str]:
-    """Read and check a bench file, one that ships by its name, or the emulated bench for ``None``.
-
-    Returns
-    -------
-    tuple
-        The bench and the file's text.
+    """Return a bench and its text: a file, one that ships by its name, or the emulated bench for ``None``.
 
     Raises
     ------
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    from importlib.resources import files
-
-    name = "emulated" if path is None else str(path)
-    shipped = files("benches").joinpath(f"{name}.toml")
-    by_name = path is None or (path.name == name and not path.suffix and not path.exists() and shipped.is_file())
-    text = shipped.read_text("utf-8") if by_name or path is None else read_text(path, "bench")
-    return parse_bench(text, f"benches/{name}.toml" if by_name else name), text
+    text, source = find("bench", "emulated" if path is None else path)
+    return parse_bench(text, source), text
 
 
 def parse_bench(text: str, source: str) -> Bench:
-    """Check the text of a bench file; ``source`` names it in messages."""
-    try:
-        return Bench.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"bench {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
-    except ValidationError as error:
-        raise FileError(explain("bench", source, error, Bench)) from error
+    """Check the text of a bench file; ``source`` names it in messages.
+
+    Raises
+    ------
+    FileError
+        Names the file, the key, the value and the allowed range.
+    """
+    return parsed(Bench, "bench", text, source)

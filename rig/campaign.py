@@ -10,20 +10,18 @@ import hashlib
 import json
 import os
 import random
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomlkit
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from rig.errors import FileError
-from rig.library import find_scene
-from rig.scene import Scene, Section, Title, parse_scene, read_text
-from rig.validation import explain
+from rig.library import find, load_scene
+from rig.scene import Scene, Section, Title, parse_scene
+from rig.validation import parsed
 
 JOURNAL = "journal.jsonl"
 
@@ -93,21 +91,8 @@ def load_campaign(path: Path) -> tuple[Campaign, list[PlannedTest]]:
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    text = _text(path)
-    try:
-        campaign = Campaign.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"campaign {path}: not valid TOML: {error}. Remedy: mend the line it names.") from error
-    except ValidationError as error:
-        raise FileError(explain("campaign", str(path), error, Campaign)) from error
+    campaign = parsed(Campaign, "campaign", *find("campaign", path))
     return campaign, list(_ordered(campaign, list(_tests(campaign, path.parent))))
-
-
-def _text(path: Path) -> str:
-    shipped = files("campaigns").joinpath(f"{path}.toml")
-    if path.name == str(path) and not path.suffix and not path.exists() and shipped.is_file():
-        return shipped.read_text("utf-8")
-    return read_text(path, "campaign")
 
 
 def single(scene: Scene, text: str, stem: str, repeats: int, seed: int) -> list[PlannedTest]:
@@ -118,8 +103,8 @@ def single(scene: Scene, text: str, stem: str, repeats: int, seed: int) -> list[
 def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
     for number, section in enumerate(campaign.test):
         beside = folder / section.scene
-        text, source = find_scene(str(beside) if beside.suffix and beside.exists() else section.scene)
-        scene = parse_scene(text, source)
+        source = beside if beside.is_file() else section.scene
+        scene, text = load_scene(source)
         repeats = section.repeats or campaign.repeats
         name = section.name or Path(source).stem
         stem = f"{number + 1:02d}-{_word(name)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import accumulate
 
-from rig.bench import Bench, PumpSection
+from rig.bench import OVERLOAD, Bench, PumpSection
 from rig.errors import Refused
 from rig.scene import (
     ComplianceSection,
@@ -27,9 +27,6 @@ REACTION_S = 0.05
 
 SLOW_UM_S = 20.0
 """Slow enough to press a rigid stop with a load train whose compliance nobody knows yet."""
-
-OVERLOAD = 1.2
-"""What a load cell survives, in capacities."""
 
 
 def check(scene: Scene, bench: Bench) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from drivers.emulated.faults import Fault, Faults
-from rig.errors import FileError
-from rig.scene import Section, read_text
-from rig.validation import explain
+from rig.library import read_text
+from rig.scene import Section
+from rig.validation import parsed
 
 Samples = Annotated[int, Field(ge=0)]
 
@@ -54,13 +53,7 @@ def load_faults(path: Path) -> Faults:
     FileError
         Names the file, the fault, the key, the value and what is allowed.
     """
-    text = read_text(path, "fault script")
-    try:
-        script = FaultScript.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"fault script {path}: not valid TOML: {error}. Remedy: mend the line it names.") from error
-    except ValidationError as error:
-        raise FileError(explain("fault script", str(path), error, FaultScript)) from error
+    script = parsed(FaultScript, "fault script", read_text("fault script", path), str(path))
     return Faults(Fault(**table.model_dump()) for table in script.fault)
 
 

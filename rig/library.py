@@ -1,31 +1,69 @@
-"""Scenes that ship with the program, by name."""
+"""Files the user names: scenes, benches and campaigns, each a file or the name of one that ships."""
 
 from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 from rig.errors import FileError
-from rig.scene import read_text
+from rig.scene import Scene, parse_scene
+
+Kind = Literal["scene", "bench", "campaign"]
+
+FOLDERS: dict[Kind, str] = {"scene": "scenes", "bench": "benches", "campaign": "campaigns"}
+"""Packages that hold what ships."""
 
 
-def find_scene(name: str) -> tuple[str, str]:
-    """Return text and source of a scene: a file, or the name of one that ships.
+def shipped(kind: Kind) -> list[str]:
+    """Return the names of what ships, in order."""
+    found = (Path(item.name) for item in files(FOLDERS[kind]).iterdir())
+    return sorted(path.stem for path in found if path.suffix == ".toml")
+
+
+def find(kind: Kind, name: str | Path) -> tuple[str, str]:
+    """Return text and source of a file, or of one that ships; its bare name always means the one that ships.
 
     Raises
     ------
     FileError
-        There is neither.
+        There is neither; the message names all that ship.
     """
-    if Path(name).suffix or Path(name).exists():
-        return read_text(Path(name), "scene"), name
-    shipped = files("scenes").joinpath(f"{name}.toml")
-    if "/" in name or "\\" in name or not shipped.is_file():
-        raise FileError(f"scene {name}: no such file, and no scene of that name ships. Remedy: one of {_names()}.")
-    return shipped.read_text("utf-8"), f"scenes/{name}.toml"
+    names = shipped(kind)
+    if str(name) not in names:
+        return read_text(kind, Path(name), f", or name one that ships: {', '.join(names)}"), str(name)
+    folder = FOLDERS[kind]
+    return files(folder).joinpath(f"{name}.toml").read_text("utf-8"), f"{folder}/{name}.toml"
 
 
-def _names() -> str:
-    return ", ".join(
-        sorted(item.name.removesuffix(".toml") for item in files("scenes").iterdir() if ".toml" in item.name)
-    )
+def load_scene(name: str | Path) -> tuple[Scene, str]:
+    """Return a scene and its text: a file, or one that ships by its name.
+
+    Raises
+    ------
+    FileError
+        Names the file, the key, the value and the allowed range.
+    """
+    text, source = find("scene", name)
+    return parse_scene(text, source), text
+
+
+def find_scene(name: str) -> tuple[str, str]:
+    """Return ``find("scene", name)``."""
+    return find("scene", name)
+
+
+def read_text(kind: str, path: Path, otherwise: str = "") -> str:
+    """Read a small UTF-8 text file; ``otherwise`` ends the remedy where there is none.
+
+    Raises
+    ------
+    FileError
+        It does not exist, or cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise FileError(f"{kind} {path}: no such file. Remedy: check the path{otherwise}.") from error
+    except (OSError, ValueError) as error:  # a path may hold what no path can
+        raise FileError(f"{kind} {path}: cannot be read ({error}). Remedy: it must be a UTF-8 text file.") from error

@@ -5,18 +5,14 @@ Keys carry their units; values leave this module in SI. What a scene does not na
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
-from rig.errors import FileError
-from rig.validation import explain
+from rig.validation import parsed
 
 Title = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Section(BaseModel):
@@ -244,39 +240,12 @@ class Scene(Section):
         )
 
 
-def load_scene(path: Path) -> Scene:
-    """Read and check a scene file.
+def parse_scene(text: str, source: str) -> Scene:
+    """Check the text of a scene file; ``source`` names it in messages.
 
     Raises
     ------
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    return parse_scene(read_text(path, "scene"), str(path))
-
-
-def parse_scene(text: str, source: str) -> Scene:
-    """Check the text of a scene file; ``source`` names it in messages."""
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"scene {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
-    return validate_scene(content, source)
-
-
-def validate_scene(content: dict[str, Any], source: str) -> Scene:
-    """Check the content of a scene file; ``source`` names it in messages."""
-    try:
-        return Scene.model_validate(content)
-    except ValidationError as error:
-        raise FileError(explain("scene", source, error, Scene)) from error
-
-
-def read_text(path: Path, what: str) -> str:
-    """Read a small UTF-8 text file, or raise ``FileError`` that says what to do."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise FileError(f"{what} {path}: no such file. Remedy: check the path; examples are in {what}s/.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"{what} {path}: cannot be read ({error}). Remedy: it must be a UTF-8 text file.") from error
+    return parsed(Scene, "scene", text, source)

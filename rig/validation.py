@@ -1,18 +1,52 @@
-"""Turn pydantic's findings into one sentence an operator can act on."""
+"""Files and tables the user writes, checked; what is wrong is one sentence an operator can act on."""
 
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from rig.errors import FileError
 
-def explain(what: str, source: str, error: ValidationError, schema: type[BaseModel]) -> str:
-    """Return file, key, value, reason and remedy for every finding, one line each."""
-    lines = [_line(finding, schema) for finding in error.errors(include_url=False)]
-    return _printable(f"{what} {source}: " + "; ".join(dict.fromkeys(lines)))
+Schema = TypeVar("Schema", bound=BaseModel)
+
+
+def parsed(schema: type[Schema], kind: str, text: str, source: str) -> Schema:
+    """Check the text of a TOML file.
+
+    Parameters
+    ----------
+    kind, source
+        What the file is, and where: the beginning of every message.
+
+    Raises
+    ------
+    FileError
+        It is not TOML, or as ``validated``.
+    """
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"{kind} {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
+    return validated(schema, kind, content, source)
+
+
+def validated(schema: type[Schema], kind: str, content: dict[str, Any], source: str) -> Schema:
+    """Check the content of a file, as ``parsed`` its text.
+
+    Raises
+    ------
+    FileError
+        Names key, value, reason and remedy of every finding.
+    """
+    try:
+        return schema.model_validate(content)
+    except ValidationError as error:
+        lines = [_line(finding, schema) for finding in error.errors(include_url=False)]
+        raise FileError(_printable(f"{kind} {source}: " + "; ".join(dict.fromkeys(lines)))) from error
 
 
 def _printable(text: str) -> str:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import settings
 
 from rig.bench import load_bench
-from rig.library import find_scene
+from rig.library import find
 from rig.scene import Scene
 from rig.session import Request
 
@@ -25,7 +25,7 @@ SHORT = {"preload_dwell_s": 1.0, "tare_s": 0.5, "retract_speed_um_s": 100.0, "pr
 
 def scene_text(name: str, **protocol: Any) -> str:
     """Return a shipped scene's text with other protocol values."""
-    text, _ = find_scene(name)
+    text, _ = find("scene", name)
     lines = text.splitlines()
     for key, value in protocol.items():
         lines = [line for line in lines if not line.startswith(f"{key} ")]

@@ -69,13 +69,6 @@ def test_the_tables_are_eight_conditions_five_times(name):
         assert f" at {test.scene.protocol.initial_pressure_kPa:+g} kPa" in test.scene.title
 
 
-def test_a_campaign_that_ships_is_found_by_its_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert len(load_campaign(Path("table-s1"))[1]) == 40
-    with pytest.raises(FileError, match="no such file"):
-        load_campaign(Path("table-s9"))
-
-
 def test_random_order_belongs_to_the_seed(tmp_path, campaign):
     first = keys(campaign)
     assert keys(campaign) == first

@@ -15,7 +15,7 @@ from analysis.sweep import sweep
 from model import Gas, InvalidParameter, Membrane, Parameters, Substrate, cone, predict
 from rig.cli import main
 from rig.commands.sweep import parse_axis
-from rig.scene import load_scene
+from rig.library import load_scene
 
 ROOT = Path(__file__).parents[1]
 FLAT = ROOT / "scenes" / "flat-high.toml"
@@ -119,7 +119,7 @@ def test_contact_stretch_is_refused_where_the_model_has_none(capsys, model):
     assert f"--contact-stretch projected: --model {model}" in err
     assert "--model membrane" in err
     with pytest.raises(InvalidParameter, match=f"{model}.*contact stretch"):
-        predict(load_scene(SPHERE).parameters(), model, contact_stretch="projected")
+        predict(load_scene(SPHERE)[0].parameters(), model, contact_stretch="projected")
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,12 @@ from PySide6.QtGui import QImage
 from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
-from rig.console.app import NoWindow, open_console, shipped_scenes
+from rig.console.app import NoWindow, open_console
 from rig.console.panels import step_words
 from rig.console.runner import Child, replay_arguments, run_arguments
 from rig.console.theme import THEMES
 from rig.console.window import Console
+from rig.library import shipped
 from rig.link import DIRECTORY_VARIABLE, LinkServer
 from rig.observe import Controls, Event, Wish
 
@@ -41,7 +42,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def console(qtbot: QtBot) -> Iterator[Console]:
-    window = Console(["sphere-60mm-low", *shipped_scenes()])
+    window = Console(["sphere-60mm-low", *shipped("scene")])
     qtbot.addWidget(window)
     window.resize(1600, 1000)
     window.show()

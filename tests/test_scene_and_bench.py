@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.bench import load_bench, parse_bench
+from rig.campaign import load_campaign
 from rig.check import check
+from rig.cli import main
 from rig.errors import FileError, Refused
-from rig.library import find_scene
-from rig.scene import load_scene, parse_scene
+from rig.library import find, load_scene, shipped
+from rig.scene import parse_scene
 
 SPHERE = '[substrate]\nshape = "sphere"\ndiameter_mm = 60.0\n'
 
@@ -40,29 +42,59 @@ def test_a_bad_scene_names_file_key_value_and_remedy(text, words):
         assert word in str(caught.value)
 
 
-def test_missing_files_are_named(tmp_path):
-    with pytest.raises(FileError, match="no such file"):
-        load_scene(tmp_path / "none.toml")
-    with pytest.raises(FileError, match="no such file"):
-        load_bench(tmp_path / "none.toml")
-    with pytest.raises(FileError, match="sphere-60mm-low"):
-        find_scene("no-such-scene")
+@pytest.mark.parametrize(
+    ("load", "kind", "one"),
+    [
+        (load_scene, "scene", "sphere-60mm-low"),
+        (load_bench, "bench", "emulated-gso25"),
+        (load_campaign, "campaign", "table-s1"),
+    ],
+)
+def test_a_file_or_the_name_of_one_that_ships(load, kind, one, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert one in shipped(kind)
+    by_name = load(Path(one))
+    file = tmp_path / "own.toml"
+    file.write_text(find(kind, one)[0], encoding="utf-8")
+    assert load(file) == by_name
+    (tmp_path / one).mkdir()
+    assert load(Path(one)) == by_name
+    for missing in (tmp_path / "none.toml", Path("none"), Path("..") / one):
+        with pytest.raises(FileError) as caught:
+            load(missing)
+        for words in (f"{kind} {missing}: no such file", "Remedy", *shipped(kind)):
+            assert words in str(caught.value)
+    with pytest.raises(FileError, match=f"{kind} .*own.*cannot be read"):
+        load(Path("own\0.toml"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["predict", "{}"],
+        ["sweep", "{}", "--vary", "diameter_mm=40,60"],
+        ["load-sharing", "{}", "--formulation", "plane-strain"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_commands_that_predict_take_the_name_of_a_scene_that_ships(words, capsys):
+    assert main([word.format("sphere-60mm-low") for word in words]) == 0
+    assert capsys.readouterr().out
+    assert main([word.format("sphere-61mm") for word in words]) == 2
+    error = capsys.readouterr().err
+    assert "scene sphere-61mm: no such file" in error
+    assert "sphere-60mm-low" in error
 
 
 def test_every_shipped_scene_is_valid_and_runs_on_an_emulated_bench():
-    from importlib.resources import files
-
     usual, _ = load_bench(None)
     small_cell, _ = load_bench(Path("emulated-gso25"))
-    for item in files("scenes").iterdir():
-        if item.name.endswith(".toml"):
-            check(parse_scene(item.read_text("utf-8"), item.name), small_cell if "fiber" in item.name else usual)
+    for name in shipped("scene"):
+        check(load_scene(name)[0], small_cell if "fiber" in name else usual)
 
 
 def test_the_paper_rig_must_be_filled_in():
-    from importlib.resources import files
-
-    text = files("benches").joinpath("paper-rig.toml").read_text("utf-8")
+    text, _ = find("bench", "paper-rig")
     with pytest.raises(FileError, match=r"slope"):
         parse_bench(text, "paper-rig.toml")
     for key in ("slope", "relative_uncertainty", "residual"):

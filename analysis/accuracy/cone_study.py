@@ -50,10 +50,7 @@ def _row(
         "method": method,
         "setting": setting,
         "evaluations": evaluations,
-        "first_s": timing.first,
-        "median_s": timing.median,
-        "lower_s": timing.lower,
-        "upper_s": timing.upper,
+        **timing.columns(),
         "error_F_p": abs(float(result.pull_off_force / truth.pull_off_force - 1)),
         "error_D_p": abs(float(result.pull_off_distance / truth.pull_off_distance - 1)),
     }

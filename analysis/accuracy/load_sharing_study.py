@@ -43,10 +43,7 @@ def _convergence(quick: bool, progress: Progress) -> Section:
                     "method": method,
                     "setting": f"{smallest * 1e6:.3g} um at the edge",
                     "evaluations": result.unknowns,
-                    "first_s": timing.first,
-                    "median_s": timing.median,
-                    "lower_s": timing.lower,
-                    "upper_s": timing.upper,
+                    **timing.columns(),
                     "error_force": abs(result.edge_force(LIFTED) / truth.edge_force(LIFTED) - 1),
                     "error_energy": abs(result.release_rate(LIFTED) / truth.release_rate(LIFTED) - 1),
                 }

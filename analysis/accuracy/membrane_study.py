@@ -51,10 +51,7 @@ def _row(method: str, setting: str, value: Shot, truth: Shot, timing: Timing, ev
         "method": method,
         "setting": setting,
         "evaluations": evaluations,
-        "first_s": timing.first,
-        "median_s": timing.median,
-        "lower_s": timing.lower,
-        "upper_s": timing.upper,
+        **timing.columns(),
         "error_force": abs(value.pull / truth.pull - 1),
         "error_height": abs(value.height / truth.height - 1),
     }

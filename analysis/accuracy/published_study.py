@@ -7,11 +7,12 @@ omega_a = 4 J/m^2 as in the text of EML, and 4.1 J/m^2 as in Table S3 beside it 
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from analysis.accuracy.section import Progress, Section
+from analysis.published import Experiment, experiments
 from model import Gas, Membrane, Parameters, Substrate, batch, cone
 from model.prediction import Prediction
 
@@ -20,57 +21,27 @@ SPHERES = np.linspace(12e-3, 60e-3, 481)
 DISKS = np.linspace(8e-3, 15e-3, 36)
 
 
-class Experiment(NamedTuple):
-    """A column of Table S1 (F_p) with D_p and z_r at F_p where the text of EML gives them; mm, kPa, N."""
-
-    diameter: float | None
-    pressure: float
-    force: float
-    distance: float | None = None
-    peak: float | None = None
-
-    @property
-    def name(self) -> str:
-        """How the report calls it."""
-        where = "flat glass" if self.diameter is None else f"{self.diameter:g} mm sphere"
-        return f"{where}, {self.pressure:+g} kPa"
+def name_of(experiment: Experiment) -> str:
+    """Return how the report calls an experiment."""
+    where = "flat glass" if experiment.diameter is None else f"{experiment.diameter * 1e3:g} mm sphere"
+    return f"{where}, {experiment.pressure / 1e3:+g} kPa"
 
 
-EXPERIMENTS = (
-    Experiment(15, 2.0, 0.13, 2.48, 1.7),
-    Experiment(15, -0.7, 0.15, 2.21),
-    Experiment(30, 2.7, 0.12),
-    Experiment(30, -4.1, 0.62),
-    Experiment(60, 1.6, 0.30, 2.24, 1.0),
-    Experiment(60, -3.2, 0.88, 1.14),
-    Experiment(None, 1.6, 0.52),
-    Experiment(None, -2.9, 1.12),
-)
-
-
-def scene(diameter_mm: float | None, pressure_kPa: float, adhesion: float = TEXT_ADHESION) -> Parameters:
-    """Return a scene with the printed parameters; no diameter is a flat."""
-    substrate = Substrate("flat") if diameter_mm is None else Substrate("sphere", diameter_mm * 1e-3)
+def _scene(substrate: Substrate, pressure_kPa: float, adhesion: float) -> Parameters:
     return Parameters(substrate, membrane=Membrane(work_of_adhesion=adhesion), gas=Gas(pressure_kPa * 1e3))
 
 
 @functools.cache
 def disks(pressure_kPa: float, adhesion: float) -> tuple[float, float]:
     """Return the largest F_p (N) and z at detachment (mm) over the flat disks of EML Fig. 6h, i."""
-    scenes = [
-        Parameters(
-            Substrate("flat", float(d)), membrane=Membrane(work_of_adhesion=adhesion), gas=Gas(pressure_kPa * 1e3)
-        )
-        for d in DISKS
-    ]
-    solved = batch.solve_many(scenes)
+    solved = batch.solve_many([_scene(Substrate("flat", float(d)), pressure_kPa, adhesion) for d in DISKS])
     return float(solved.pull_off_force.max()), float(solved.detachment_position.max()) * 1e3
 
 
 @functools.cache
 def distance_maximum(pressure_kPa: float, adhesion: float) -> tuple[float, float]:
     """Return the diameter (mm) of largest D_p, and the drop (%) from there to 60 mm (EML Fig. 5f)."""
-    solved = batch.solve_many([scene(float(d) * 1e3, pressure_kPa, adhesion) for d in SPHERES])
+    solved = batch.solve_many([_scene(Substrate("sphere", float(d)), pressure_kPa, adhesion) for d in SPHERES])
     best = int(np.argmax(solved.pull_off_distance))
     drop = 1 - solved.pull_off_distance[-1] / solved.pull_off_distance[best]
     return float(SPHERES[best]) * 1e3, float(drop) * 100
@@ -79,12 +50,12 @@ def distance_maximum(pressure_kPa: float, adhesion: float) -> tuple[float, float
 @functools.cache
 def predicted(experiment: Experiment, *, contact_stretch: bool = True) -> Prediction:
     """Return the prediction for an experiment."""
-    return cone.solve(scene(experiment.diameter, experiment.pressure), contact_stretch=contact_stretch, points=64)
+    return cone.solve(experiment.parameters, contact_stretch=contact_stretch, points=64)
 
 
 def mean_deviation(*, contact_stretch: bool, spheres_only: bool = False) -> float:
     """Return the mean of |F_p predicted / measured - 1| over Table S1, per cent."""
-    chosen = [one for one in EXPERIMENTS if one.diameter is not None or not spheres_only]
+    chosen = [one for one in experiments() if one.diameter is not None or not spheres_only]
     deviations = [abs(predicted(one, contact_stretch=contact_stretch).pull_off_force / one.force - 1) for one in chosen]
     return float(np.mean(deviations)) * 100
 
@@ -121,39 +92,32 @@ def model_numbers() -> Any:
     )
 
 
-def experiments() -> Any:
+def experiment_numbers() -> Any:
     """Return Table S1 and the distances of EML's text beside both models."""
     import pandas as pd
 
     rows = []
-    for one in EXPERIMENTS:
-        with_stretch, without = predicted(one), predicted(one, contact_stretch=False)
-        pairs = [("F_p (N)", one.force, with_stretch.pull_off_force, without.pull_off_force)]
-        if one.distance is not None:
-            pairs.append(
-                ("D_p (mm)", one.distance, with_stretch.pull_off_distance * 1e3, without.pull_off_distance * 1e3)
+    for one in experiments():
+        ours, older = predicted(one), predicted(one, contact_stretch=False)
+        for quantity, scale, measured, feature in (
+            ("F_p (N)", 1.0, one.force, "pull_off_force"),
+            ("D_p (mm)", 1e3, one.distance, "pull_off_distance"),
+            ("z_r at F_p (mm)", 1e3, one.retraction_at_force, "retraction_at_pull_off"),
+        ):
+            if measured is None:
+                continue
+            printed, new, old = (scale * value for value in (measured, getattr(ours, feature), getattr(older, feature)))
+            rows.append(
+                {
+                    "experiment": name_of(one),
+                    "quantity": quantity,
+                    "measured": printed,
+                    "cone": new,
+                    "deviation %": (new / printed - 1) * 100,
+                    "cone-2017": old,
+                    "deviation % (2017)": (old / printed - 1) * 100,
+                }
             )
-        if one.peak is not None:
-            pairs.append(
-                (
-                    "z_r at F_p (mm)",
-                    one.peak,
-                    with_stretch.retraction_at_pull_off * 1e3,
-                    without.retraction_at_pull_off * 1e3,
-                )
-            )
-        rows += [
-            {
-                "experiment": one.name,
-                "quantity": quantity,
-                "measured": measured,
-                "cone": ours,
-                "deviation %": (ours / measured - 1) * 100,
-                "cone-2017": older,
-                "deviation % (2017)": (older / measured - 1) * 100,
-            }
-            for quantity, measured, ours, older in pairs
-        ]
     return pd.DataFrame(rows)
 
 
@@ -179,7 +143,7 @@ def sections(quick: bool, progress: Progress) -> list[Section]:
         Section(
             "Published numbers",
             text,
-            {"published-model": model_numbers(), "published-experiments": experiments()},
+            {"published-model": model_numbers(), "published-experiments": experiment_numbers()},
             captions={
                 "published-model": "What EML says its model gives, and ours.",
                 "published-experiments": "Table S1 (F_p) and the text of EML (D_p, z_r), and both models at 4 J/m2.",

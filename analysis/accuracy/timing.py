@@ -23,6 +23,10 @@ class Timing(NamedTuple):
     lower: float
     upper: float
 
+    def columns(self) -> dict[str, float]:
+        """Return the seconds by the columns of a work-precision table."""
+        return {f"{name}_s": seconds for name, seconds in self._asdict().items()}
+
 
 def timed(function: Callable[[], Result], repeats: int) -> tuple[Result, Timing]:
     """Return the result and how long it took, first call and ``repeats`` warm ones apart."""

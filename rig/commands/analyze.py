@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from analysis.batch import Analyzed
     from analysis.report import Source
 
-SUMMARY = "turn recordings into features, tables and reports"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    from model import MODELS
+
     parser.add_argument("recordings", nargs="*", type=Path, metavar="FILE", help="recordings (.h5)")
     output = parser.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print one JSON object")
@@ -31,9 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pdf", type=Path, metavar="PDF", help="write the report as PDF")
     parser.add_argument("--curves", type=Path, metavar="DIR", help="write each curve, and each mean of repeats, as CSV")
     parser.add_argument("--afm", type=Path, metavar="DIR", help="write each run as .tab for afmformats, nanite, PyJibe")
-    parser.add_argument(
-        "--model", choices=("cone", "cone-2017", "membrane"), default="cone", help="model drawn over the data"
-    )
+    parser.add_argument("--model", choices=MODELS, default="cone", help="model drawn over the data")
     parser.add_argument("--title", default="Pull-off tests", help="title of the report")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on instead")

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.commands import BENCH
+
 if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.campaign import Journal, PlannedTest
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("file", type=Path, help="campaign file, or the name of one that ships")
-    parser.add_argument("--bench", type=Path, help="bench file; without one everything is emulated")
+    parser.add_argument("--bench", type=Path, help=f"{BENCH}; without one everything is emulated")
     parser.add_argument("--out", type=Path, help="folder of the recordings (default: recordings/<campaign>)")
     parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
     parser.add_argument("--jobs", type=int, default=1, help="emulated bench: tests at the same time")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rig.commands import BENCH, SCENE
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", nargs="?", help="scene to choose at the start")
-    parser.add_argument("--bench", type=Path, help="bench file to choose at the start")
+    parser.add_argument("scene", nargs="?", help=f"chosen at the start: {SCENE}")
+    parser.add_argument("--bench", type=Path, help=f"chosen at the start: {BENCH}")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="replay a recording")
     parser.add_argument("--theme", choices=("dark", "light"), default="dark", help="colours (default: dark)")
     parser.add_argument("--alone", action="store_true", help="do not attach to a run that is already going")

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.commands import BENCH
+
 if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.doctor import Finding
@@ -14,7 +16,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--bench", type=Path, help="bench file; without one the emulated bench is checked")
+    parser.add_argument("--bench", type=Path, help=f"{BENCH}; without one the emulated bench is checked")
     parser.add_argument("--json", action="store_true", help="one JSON list on standard output")
 
 
@@ -43,13 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _emulated(bench: Bench, text: str) -> Iterator[Finding]:
     from rig.doctor import examine_emulated
     from rig.instruments import open_instruments
-    from rig.library import find_scene
+    from rig.library import load_scene
     from rig.safe_state import release
-    from rig.scene import parse_scene
     from rig.session import Request
 
-    scene_text, source = find_scene("sphere-60mm-low")
-    scene = parse_scene(scene_text, source)
+    scene, scene_text = load_scene("sphere-60mm-low")
     request = Request(scene, scene_text, bench, text, Path())
     opened = open_instruments(request)
     try:

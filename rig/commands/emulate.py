@@ -7,8 +7,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rig.commands import SCENE
+
 if TYPE_CHECKING:
-    from drivers.emulated.faults import Faults
     from drivers.emulated.truth import Truth
 
 LATENCY = 5e-3
@@ -20,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pty", action="store_true", help="serve stage and pump on pseudo-terminals too (POSIX)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times real time (default: 1)")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="fault script (TOML)")
-    parser.add_argument("--scene", metavar="SCENE", help="substrate and gripper of this scene (default: 60 mm sphere)")
+    parser.add_argument("--scene", metavar="SCENE", help=f"what to pull off: {SCENE} (default: 60 mm sphere)")
     parser.add_argument("--seed", type=int, default=0, help="which specimen and which noise")
 
 
@@ -31,6 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from drivers.emulated.bench import EmulatedBench
     from rig.errors import FileError
+    from rig.fault_script import load_faults
 
     if not 0 < arguments.speed <= 1000:
         raise FileError(f"--speed {arguments.speed:g}: must be above 0 and at most 1000. Remedy: e.g. --speed 1.")
@@ -52,23 +54,15 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def load_faults(path: Path) -> Faults:
-    """Read a fault script; see ``rig.fault_script``."""
-    from rig import fault_script
-
-    return fault_script.load_faults(path)
-
-
 def _truth(scene: str | None, seed: int) -> Truth:
     from drivers.emulated.truth import Truth
 
     if scene is None:
         return Truth.pull_off(seed=seed)
     from rig import emulation
-    from rig.library import find_scene
-    from rig.scene import parse_scene
+    from rig.library import load_scene
 
-    return emulation.truth(parse_scene(*find_scene(scene)), seed)
+    return emulation.truth(load_scene(scene)[0], seed)
 
 
 def _endpoints(bench: Any, terminals: bool) -> dict[str, str]:

@@ -9,19 +9,17 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from analysis.repeats import Group
 
-SUMMARY = "draw a figure of the papers"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``rig figure``."""
+    """Declare the options."""
+    from model import MODELS
+
     parser.add_argument("number", help="2a ... 6i, S8, S9, sampling; 'all', or 'list' to see what there is")
     parser.add_argument(
         "recordings", nargs="*", type=Path, help="recordings to draw from; without any the models stand alone"
     )
     parser.add_argument("--out", type=Path, help="picture (.png, .svg, .pdf) or directory (default: figures/)")
-    parser.add_argument(
-        "--model", choices=("cone", "cone-2017", "membrane"), default="cone", help="model of the theory"
-    )
+    parser.add_argument("--model", choices=MODELS, default="cone", help="model of the theory")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rig.commands import SCENE
+
 if TYPE_CHECKING:
     from model.load_sharing import LoadSharing
 
@@ -17,7 +19,7 @@ MEASURED = "measured adhesion efficiency: 1.8-6.6 % (rigid gripper), up to 26 % 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", metavar="SCENE", help=SCENE)
     parser.add_argument(
         "--formulation", choices=FORMULATIONS, default="axisymmetric", help="equations (default: axisymmetric)"
     )
@@ -38,9 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Solve the film with and without its fibre layer and print the measures that converge."""
     from model.load_sharing import Fibres, Film, solve
-    from rig.scene import load_scene
+    from rig.library import load_scene
 
-    scene = load_scene(arguments.scene)
+    scene, _ = load_scene(arguments.scene)
     parameters = scene.parameters()
     film = Film.of(parameters)
     stuck = solve(film, arguments.formulation)

@@ -8,6 +8,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rig.commands import SCENE
+
 if TYPE_CHECKING:
     from model.prediction import Prediction
     from rig.scene import Scene
@@ -29,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     from model import MODELS, ContactStretch
 
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", metavar="SCENE", help=SCENE)
     parser.add_argument("--model", choices=MODELS, default="cone", help="adhesion model (default: cone)")
     parser.add_argument(
         "--contact-stretch",
@@ -50,12 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict and print. A physical outcome other than pull-off is an answer; an impossible scene is an error."""
-    from rig.scene import load_scene
+    from rig.library import load_scene
 
-    scene = load_scene(arguments.scene)
+    scene, _ = load_scene(arguments.scene)
     prediction = predict_scene(
         scene,
-        str(arguments.scene),
+        arguments.scene,
         model=arguments.model,
         contact_stretch=arguments.contact_stretch,
         pressure_kPa=arguments.pressure_kpa,

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rig.commands import BENCH
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--bench", type=Path, required=True, help="bench file")
+    parser.add_argument("--bench", type=Path, required=True, help=BENCH)
     parser.add_argument("--path-is-clear", action="store_true", help="confirm without being asked")
 
 
@@ -16,8 +18,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Ask, then move: the stage may run its full travel."""
     from rig.bench import load_bench
     from rig.errors import Refused
-    from rig.library import find_scene
-    from rig.scene import parse_scene
+    from rig.library import load_scene
     from rig.session import Request, reference_only
 
     bench, bench_text = load_bench(arguments.bench)
@@ -25,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
         print("The stage will run to its switch, up to its full travel. Take specimen and gripper out of its path.")
         if input("Type 'clear' when the path is clear: ").strip() != "clear":
             raise Refused("not confirmed. Nothing has moved.")
-    text, source = find_scene("sphere-60mm-vented")
-    position = reference_only(Request(parse_scene(text, source), text, bench, bench_text, Path()))
+    scene, text = load_scene("sphere-60mm-vented")
+    position = reference_only(Request(scene, text, bench, bench_text, Path()))
     print(f"referenced; the stage stands at {position * 1e3:.4f} mm")
     return 0

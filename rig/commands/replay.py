@@ -8,10 +8,12 @@ from pathlib import Path
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    from model import MODELS
+
     parser.add_argument("file", type=Path, help="recording")
     parser.add_argument("--speed", default="max", help="times real time, or max (default)")
     parser.add_argument("--verify", action="store_true", help="demand every derived value identical to the bit")
-    parser.add_argument("--model", choices=("cone", "cone-2017", "membrane"), help="what if: predict with this model")
+    parser.add_argument("--model", choices=MODELS, help="what if: predict with this model")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="what if: another scene value")
     parser.add_argument("--console", action="store_true", help="watch the replay in the console's window")
     parser.add_argument("--link", action="store_true", help="let consoles attach")
@@ -23,6 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     import math
     import sys
     import time
+    from contextlib import ExitStack
 
     from rig.commands.run import parse_speed
     from rig.observe import Controls, Observer
@@ -39,14 +42,12 @@ def run(arguments: argparse.Namespace) -> int:
     speed = parse_speed(arguments.speed)
     controls = Controls()
     observers: list[Observer] = [] if arguments.verify else [Terminal()]
-    server = None
-    if arguments.link:
-        from rig.link import LinkServer
+    with ExitStack() as links:
+        if arguments.link:
+            from rig.link import LinkServer
 
-        server = LinkServer(controls)
-        observers.append(server)
-    began = time.perf_counter()
-    try:
+            observers.append(links.enter_context(LinkServer(controls)))
+        began = time.perf_counter()
         outcome = replay(
             recording,
             pace=Pace(math.inf if speed is None else speed),
@@ -55,10 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
             live=not arguments.no_live,
             what_if=what_if(recording, arguments.model, arguments.set),
         )
-    finally:
-        if server is not None:
-            server.close()
-    wall = time.perf_counter() - began
+        wall = time.perf_counter() - began
     seconds = recording.force.size / recording.rate
     print(f"{arguments.file}: {seconds:.1f} s replayed in {wall:.2f} s ({seconds / wall:.0f} times real time)")
     if not arguments.verify:

@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.commands import BENCH, SCENE
+
 if TYPE_CHECKING:
     from rig.campaign import PlannedTest
-    from rig.observe import Ending
+    from rig.observe import Ending, Observer
     from rig.operator import Keyboard
     from rig.session import Request
 
@@ -18,8 +20,8 @@ DEFAULT_SCENE = "sphere-60mm-low"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", nargs="?", default=DEFAULT_SCENE, help="scene file, or the name of one that ships")
-    parser.add_argument("--bench", type=Path, help="bench file; without one everything is emulated")
+    parser.add_argument("scene", nargs="?", default=DEFAULT_SCENE, help=SCENE)
+    parser.add_argument("--bench", type=Path, help=f"{BENCH}; without one everything is emulated")
     parser.add_argument("--out", type=Path, help="recording to write (default: recordings/<scene>-<time>.h5)")
     parser.add_argument("--seed", type=int, default=0, help="emulated bench: which specimen and which noise")
     parser.add_argument("--speed", default="max", help="emulated bench: times real time, or max (default)")
@@ -56,21 +58,19 @@ def _requests(arguments: argparse.Namespace) -> Iterator[tuple[PlannedTest, Requ
     from rig.bench import load_bench
     from rig.campaign import single
     from rig.errors import FileError
-    from rig.library import find_scene
-    from rig.scene import parse_scene
+    from rig.library import load_scene
     from rig.session import Request
 
-    text, source = find_scene(arguments.scene)
-    scene = parse_scene(text, source)
+    scene, text = load_scene(arguments.scene)
     bench, bench_text = load_bench(arguments.bench)
     if not bench.is_emulated and arguments.speed != "max":
         raise FileError("--speed: real instruments run in real time. Remedy: leave it out.")
     faults = None
     if arguments.faults is not None:
-        from rig.commands.emulate import load_faults
+        from rig.fault_script import load_faults
 
         faults = load_faults(arguments.faults)
-    tests = single(scene, text, Path(source).stem, arguments.repeat, arguments.seed)
+    tests = single(scene, text, Path(arguments.scene).stem, arguments.repeat, arguments.seed)
     for number, test in enumerate(tests, 1):
         yield (
             test,
@@ -118,25 +118,22 @@ def _destination(out: Path | None, key: str, count: int) -> Path:
 
 def _run_once(request: Request, arguments: argparse.Namespace, keyboard: Keyboard) -> Ending:
     import sys
+    from contextlib import ExitStack
 
     from rig.operator import Prompts
     from rig.session import run_scene
     from rig.terminal import Terminal
 
-    observers: list[object] = [Terminal()]
+    observers: list[Observer] = [Terminal()]
     if not request.bench.is_emulated:
         observers.append(Prompts(keyboard, request.controls))
-    if arguments.link:
-        from rig.link import LinkServer
+    request.observers = observers
+    with ExitStack() as links:
+        if arguments.link:
+            from rig.link import LinkServer
 
-        observers.append(LinkServer(request.controls))
-    request.observers = observers  # type: ignore[assignment]
-    try:
+            observers.append(links.enter_context(LinkServer(request.controls)))
         ending = run_scene(request)
-    finally:
-        for observer in observers:
-            if hasattr(observer, "close"):
-                observer.close()
     if ending.exit_code:
         print(f"rig run: {ending.reason}", file=sys.stderr)
         print(f"rig run: the recording {request.out} holds the {ending.samples} samples so far.", file=sys.stderr)

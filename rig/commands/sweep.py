@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rig.commands import SCENE
+
 if TYPE_CHECKING:
     from rig.scene import Scene
 
@@ -17,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     from model import MODELS
 
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", metavar="SCENE", help=SCENE)
     parser.add_argument(
         "--vary",
         action="append",
@@ -36,10 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Predict every combination and write the table."""
     from analysis.sweep import sweep
     from rig.commands.predict import refuse_unmodelled
-    from rig.scene import load_scene
+    from rig.library import load_scene
 
-    source = str(arguments.scene)
-    scene = load_scene(arguments.scene)
+    source = arguments.scene
+    scene, _ = load_scene(source)
     bound = refuse_unmodelled(scene, source, rigid_bound=arguments.rigid_bound)
     axes = [parse_axis(text) for text in arguments.vary]
     keys = [resolve(scene, key) for key, _ in axes]
@@ -117,20 +119,14 @@ def resolve(scene: Scene, key: str) -> str:
 
 def changed(scene: Scene, source: str, values: dict[str, float]) -> Scene:
     """Return the scene with keys replaced, checked as if its file had said so."""
-    from pydantic import ValidationError
-
-    from rig.errors import FileError
     from rig.scene import Scene
-    from rig.validation import explain
+    from rig.validation import validated
 
     content: dict[str, Any] = scene.model_dump()
     for key, value in values.items():
         section, _, name = key.partition(".")
         content[section][name] = value
-    try:
-        return Scene.model_validate(content)
-    except ValidationError as error:
-        raise FileError(explain("scene", f"{source} with --vary", error, Scene)) from error
+    return validated(Scene, "scene", content, f"{source} with --vary")
 
 
 def write(table: Any, path: Path) -> None:

@@ -9,20 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from rig.errors import RigError
+from rig.library import shipped
 
 
 class NoWindow(RigError):
     """There is no screen to open a window on, or Qt is not installed."""
 
     exit_code = 2
-
-
-def shipped_scenes() -> list[str]:
-    """Return the names of the scenes that ship."""
-    from importlib.resources import files
-
-    names = (item.name for item in files("scenes").iterdir())
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def open_console(
@@ -73,7 +66,7 @@ def open_console(
 
 
 def _scenes(first: str | None) -> list[str]:
-    names = shipped_scenes()
+    names = shipped("scene")
     if first is None:
         return names
     return [first, *(name for name in names if name != first)]
