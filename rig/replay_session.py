@@ -19,7 +19,8 @@ from rig.protocols import build_steps
 from rig.recording import Recording
 from rig.replay import EndOfRecording, Pace, ReplayedControls, ReplayedDaq, ReplayedPump, ReplayedStage, Verification
 from rig.safe_state import make_safe
-from rig.scene import Scene, Section, validate_scene
+from rig.scene import Scene, Section
+from rig.validation import validated
 from sequences.errors import StepFailed
 from sequences.step import Apparatus, play
 
@@ -137,7 +138,7 @@ def what_if(recording: Recording, model: str | None, changes: Sequence[str]) -> 
             table[name] = float(value)
         except ValueError:
             table[name] = value.strip()
-    scene = validate_scene(content, f"{recording.path} with {', '.join(changes)}")
+    scene = validated(Scene, "scene", content, f"{recording.path} with {', '.join(changes)}")
     return WhatIf(scene.parameters(), model or "cone")
 
 
