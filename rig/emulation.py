@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -90,20 +89,32 @@ def _device(bench: Bench) -> Device:
     return usb_6211(cell=cell)
 
 
-class Hands(Watcher):
-    """The emulated operator: does what a prompt asks and lets the run go on."""
+def weights(scene: Scene) -> list[float]:
+    """Return what the operator hangs on the gripper in a scene, prompt by prompt, kg."""
+    from rig.scene import DeadWeightsSection
+    from sequences.calibration import weighing_order
 
-    def __init__(self, controls: Controls, world: EmulatedBench) -> None:
+    protocol = scene.protocol
+    return (
+        weighing_order([mass * 1e-3 for mass in protocol.masses_g]) if isinstance(protocol, DeadWeightsSection) else []
+    )
+
+
+class Hands(Watcher):
+    """The emulated operator: hangs the next mass (kg), if there is one, whenever a prompt asks, and lets the run go on."""
+
+    def __init__(self, controls: Controls, world: EmulatedBench, masses: Iterable[float] = ()) -> None:
         self._controls = controls
         self._world = world
+        self._masses = iter(masses)
 
     def event(self, event: Event) -> None:
         """Answer a prompt."""
         if event.kind != "prompt":
             return
-        weight = re.match(r"Hang ([0-9.e+-]+) g|Take every weight off", event.text)
-        if weight:
+        mass = next(self._masses, None)
+        if mass is not None:
             from drivers.emulated.specimens import DeadWeight
 
-            self._world.plant.mount(DeadWeight(float(weight[1] or 0.0) * 1e-3))
+            self._world.plant.mount(DeadWeight(mass))
         self._controls.resume()

@@ -84,7 +84,7 @@ def _open_claimed(bench: Bench, pressure: bool) -> Opened:
 
 
 def _open_emulated(request: Request) -> Opened:
-    from rig.emulation import Hands, emulated_bench
+    from rig.emulation import Hands, emulated_bench, weights
 
     emulated = emulated_bench(request)
     try:
@@ -100,7 +100,7 @@ def _open_emulated(request: Request) -> Opened:
         emulated.close()
         raise
     opened.virtual = request.speed is None
-    opened.observers += [_StepsToFaults(emulated), Hands(request.controls, emulated)]
+    opened.observers += [_StepsToFaults(emulated), Hands(request.controls, emulated, weights(request.scene))]
     opened.shut_down = emulated.close
     return opened
 

@@ -23,7 +23,7 @@ GONE = 0.05
 
 
 class Glance(NamedTuple):
-    """A frame in seven numbers: means of force (N, untared) and pressure (Pa, or ``nan``), and the stage's position."""
+    """A frame in short: means of force (N, untared) and pressure (Pa, or ``nan``), and the stage's position."""
 
     number: int
     start: int

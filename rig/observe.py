@@ -1,4 +1,4 @@
-"""What a run tells its observers (recorder, terminal, console link, live prediction) and what they may ask of it."""
+"""What a run tells its observers (terminal, console link, live prediction) and what they may ask of it."""
 
 from __future__ import annotations
 
@@ -38,13 +38,15 @@ class RunInfo:
     plan
         The steps to come.
     limits
-        Bench and scene limits in SI, by name (``force_compression_N``, ``travel_low_m``, ...).
+        Bench and scene limits in SI, by name (``compression_N``, ``travel_low_m``, ...).
     scene
         The scene as it was checked, by section.
     identities
         What each instrument said of itself.
     virtual
         Whether the time of the bench is the plant's and not the wall's.
+    repeat, repeats
+        Which of how many tests of this scene in a row, from 1.
     """
 
     title: str
@@ -111,7 +113,7 @@ class Observer(Protocol):
     """Told of everything on the loop's thread; must never block it. An observer that raises is dropped, loudly."""
 
     def started(self, info: RunInfo) -> None:
-        """The instruments are open; nothing has moved."""
+        """The instruments are open, the stage is referenced; no step has begun."""
         ...
 
     def frame(self, frame: Frame) -> None:

@@ -93,7 +93,7 @@ class Recorder:
     channels
         Names of the raw channels, in order.
     metadata
-        Texts kept whole beside the data: scene, bench, calibrations, versions, seed, ...
+        Texts kept whole beside the data: scene, bench, versions, seed, place, start of the process.
     journalled
         Whether what is acknowledged survives a power cut too, by a journal beside the recording (``rig.journal``).
 

@@ -53,8 +53,16 @@ class Request:
     ----------
     scene_text, bench_text
         The files as they were read; they are kept in the recording.
+    out
+        The recording; it must not exist.
+    live
+        Whether to predict live where the papers have a model.
+    observers, controls
+        Who is told of everything, and how the operator speaks to the run.
     place
         Position on the membrane, or sample, where a protocol names several.
+    repeat, repeats
+        Which of how many tests of this scene in a row, from 1.
     seed, speed, wire, faults, referenced
         For the emulated bench only: ``speed`` in times real time, ``None`` as fast as possible; ``wire`` false puts
         the instruments straight on the plant; ``referenced`` is a stage that has not been off since its reference move.
