@@ -101,7 +101,7 @@ def weights(scene: Scene) -> list[float]:
 
 
 class Hands(Watcher):
-    """The emulated operator: hangs the next mass (kg), if there is one, whenever a prompt asks, and lets the run go on."""
+    """The emulated operator: hangs the next mass (kg), if any, whenever a prompt asks, and lets the run go on."""
 
     def __init__(self, controls: Controls, world: EmulatedBench, masses: Iterable[float] = ()) -> None:
         self._controls = controls
