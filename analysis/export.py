@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +11,18 @@ import numpy as np
 from analysis.errors import AnalysisError
 from analysis.numerics import Array, block_means
 from analysis.pipeline import Analysis
-from analysis.repeats import pooled_frame
+from analysis.repeats import group, pooled_frame
 
 AFM_POINTS = 20_000
 """A curve is averaged into at most so many points for export."""
 
 
-def features_csv(analyses: Iterable[Analysis]) -> str:
-    """Return one row per run and feature: run, feature, value, uncertainty, unit, explanation."""
+def features_csv(analyses: Sequence[Analysis]) -> str:
+    """Return one row per run and feature: run, feature, value, uncertainty, unit, explanation.
+
+    Of several runs also one row per condition and feature: the condition in place of the run, mean, uncertainty of the
+    mean, unit, and two columns of their own: standard_deviation and count (empty for single runs).
+    """
     import pandas as pd
 
     frames = []
@@ -26,14 +30,15 @@ def features_csv(analyses: Iterable[Analysis]) -> str:
         frame = analysis.features.frame().reset_index()
         frame.insert(0, "run", analysis.run.name)
         frames.append(frame)
+    if len(analyses) > 1:
+        names = {"condition": "run", "mean": "value", "uncertainty_of_mean": "uncertainty"}
+        frames.append(pooled_frame(group(analyses)).rename(columns=names))
     table = pd.concat(frames, ignore_index=True)
     return str(table.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
 def features_json(analyses: Sequence[Analysis]) -> dict[str, object]:
     """Return one object: the features of a single run, or ``runs`` and ``pooled`` of several."""
-    from analysis.repeats import group
-
     if len(analyses) == 1:
         return _one(analyses[0])
     groups = group(analyses)

@@ -24,7 +24,7 @@ from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, MARKERS, ORANGE, P
 from analysis.indentation import fit_contact, indenter_radius
 from analysis.numerics import running_mean
 from analysis.pipeline import Analysis
-from analysis.published import TABLE_S1
+from analysis.published import experiments
 from analysis.repeats import Group
 from model import jkr
 from model.parameters import Parameters
@@ -40,9 +40,7 @@ RETRACT_SPEED = 10e-6
 
 def _published_scenes(diameter: float | None) -> list[tuple[float, Parameters]]:
     """Return (P_0, scene) at the highest and lowest pressure of Table S1, and in between."""
-    name = "Flat Glass" if diameter is None else f"d_b {diameter * 1e3:g} mm"
-    column = next(column for column in TABLE_S1 if column.substrate == name)
-    high, low = float(column.highest_pressure) * 1e3, float(column.lowest_pressure) * 1e3
+    high, low = (test.pressure for test in experiments() if test.diameter == diameter)
     pressures = [high, 0.0, low] if high * low < 0 else [high, low]
     return [(pressure, scene(diameter, pressure)) for pressure in pressures]
 
@@ -263,9 +261,9 @@ def figure_5c(figure: Figure, material: Material) -> pd.DataFrame:
     """Draw F_p against P_0: measured means with standard deviations, predictions dashed, Table S1 as open symbols."""
     axes, series = figure.subplots(), Series()
     substrates: Sequence[float | None] = (*SPHERES, None)
-    for diameter, column, color, marker in zip(substrates, TABLE_S1, CYCLE, MARKERS, strict=False):
+    for diameter, color, marker in zip(substrates, CYCLE, MARKERS, strict=False):
         label = "flat" if diameter is None else f"{diameter * 1e3:g} mm"
-        printed = _printed(axes, column.substrate, color, marker)
+        printed = _printed(axes, diameter, color, marker)
         groups = [m for m in _of_substrate(material, diameter) if m.pooled("pull_off_force_N")]
         ends = printed
         if groups:
@@ -286,13 +284,15 @@ def figure_5c(figure: Figure, material: Material) -> pd.DataFrame:
     return series.frame()
 
 
-def _printed(axes: Axes, substrate: str, color: str, marker: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _printed(
+    axes: Axes, diameter: float | None, color: str, marker: str
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Draw the two published points; return their pressures, Pa."""
-    column = next(column for column in TABLE_S1 if column.substrate == substrate)
-    pressures = np.array([float(column.highest_pressure), float(column.lowest_pressure)])
-    forces = np.array([float(column.least_force), float(column.largest_force)])
-    axes.plot(pressures, forces, marker, color=color, markerfacecolor="none", markersize=6)
-    return pressures * 1e3
+    tests = [test for test in experiments() if test.diameter == diameter]
+    pressures = np.array([test.pressure for test in tests])
+    forces = [test.force for test in tests]
+    axes.plot(pressures / 1e3, forces, marker, color=color, markerfacecolor="none", markersize=6)
+    return pressures
 
 
 def _measured_points(
