@@ -88,6 +88,7 @@ def test_report_writes_page_tables_and_pictures(tmp_path, monkeypatch):
     assert "## A study" in page
     assert page.count("| a | 1.235e-07 |") == 1
     assert "(accuracy/long.csv)" in page
+    assert "(long.csv)" in (tmp_path / "accuracy" / "one_study.md").read_text(encoding="utf-8")
     assert (tmp_path / "accuracy" / "picture.png").read_bytes() == b"png"
     assert "| b | - |" in markdown(table)
 

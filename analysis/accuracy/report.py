@@ -6,6 +6,7 @@ import importlib
 import math
 import pkgutil
 import platform
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -52,9 +53,14 @@ def write_report(folder: Path, *, quick: bool, progress: Progress, only: str | N
             (files / f"{name}.md").write_text("\n".join([*parts, note]), encoding="utf-8", newline="\n")
     page = folder / "accuracy.md"
     fragments = [files / f"{name}.md" for name in names]
-    written = [fragment.read_text(encoding="utf-8") for fragment in fragments if fragment.exists()]
+    written = [_from_above(fragment.read_text(encoding="utf-8")) for fragment in fragments if fragment.exists()]
     page.write_text("\n".join([HEADING, *written]), encoding="utf-8", newline="\n")
     return page
+
+
+def _from_above(part: str) -> str:
+    """Return a part with links that start in the folder above, where the page is; it is written with its own."""
+    return re.sub(r"\]\((?!\w+:)", f"]({FOLDER}/", part)
 
 
 def _sections(study: str) -> Callable[[bool, Progress], list[Section]]:
@@ -90,10 +96,10 @@ def _write_section(section: Section, files: Path) -> str:
         caption = section.captions.get(name, "")
         if name not in section.csv_only:
             lines += [markdown(table), ""]
-        lines.append(f"{caption} ([CSV]({FOLDER}/{name}.csv))\n".strip() + "\n")
+        lines.append(f"{caption} ([CSV]({name}.csv))\n".strip() + "\n")
     for name, draw in section.figures.items():
         draw(files / f"{name}.png")
-        lines.append(f"![{section.captions.get(name, name)}]({FOLDER}/{name}.png)\n")
+        lines.append(f"![{section.captions.get(name, name)}]({name}.png)\n")
         if name in section.captions:
             lines.append(f"*{section.captions[name]}*\n")
     return "\n".join(lines)
