@@ -113,6 +113,16 @@ def test_a_scene_without_pressure_shows_no_pressure(console: Console, qtbot: QtB
     assert console.readings.pressure.isVisible()
 
 
+def test_a_bench_is_chosen_by_the_name_of_one_that_ships(console: Console) -> None:
+    console.controls.scene.setCurrentText("fiber")
+    assert console.state.text() == "refused"
+    console.controls.add_bench(Path("emulated-gso25"))
+    assert console.state.text() == "checked: ready"
+    console.controls.add_bench(Path("none.toml"))
+    assert console.state.text() == "refused"
+    assert "bench none.toml: no such file" in console.banner.text()
+
+
 def test_a_bad_scene_is_refused_with_key_value_and_remedy(console: Console, tmp_path: Path) -> None:
     bad = tmp_path / "bad.toml"
     bad.write_text('[substrate]\nshape = "sphere"\ndiameter_mm = -5.0\n')

@@ -112,6 +112,15 @@ def test_csv_and_words(files: list[str], capsys: pytest.CaptureFixture[str]) -> 
     assert main(["analyze", files[0], "--csv"]) == 0
     table = pd.read_csv(io.StringIO(capsys.readouterr().out))
     assert {"run", "feature", "value", "uncertainty", "unit", "explanation"} == set(table.columns)
+    assert main(["analyze", *files, "--csv"]) == 0
+    table = pd.read_csv(io.StringIO(capsys.readouterr().out))
+    force = table[table["feature"] == "pull_off_force_N"]
+    pooled, single = force[force["count"].notna()].iloc[0], force[force["count"].isna()]
+    assert list(single["run"]) == ["first", "second"]
+    assert pooled["count"] == 2
+    assert pooled["value"] == pytest.approx(single["value"].mean())
+    assert pooled["standard_deviation"] == pytest.approx(single["value"].std(), rel=1e-4)
+    assert "60 mm" in pooled["run"]
     assert main(["analyze", files[2]]) == 0
     words = capsys.readouterr().out
     assert "aborted" in words

@@ -104,6 +104,12 @@ def test_the_paper_rig_must_be_filled_in():
     assert parse_bench(text.replace("FILL-IN", "a").replace("FILL IN", "a"), "x").force.cell == "GSO-500"
 
 
+def test_a_frame_holds_a_whole_number_of_samples_and_at_least_one():
+    daq = load_bench(None)[0].daq
+    assert daq.frame_ms == 20.0
+    assert [daq.frame_samples(rate) for rate in (1000.0, 1024.5, 10.0)] == [20, 20, 1]
+
+
 def test_limits_beyond_the_load_cell_are_refused():
     _, text = load_bench(None)
     with pytest.raises(FileError, match="120 %"):

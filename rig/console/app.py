@@ -53,7 +53,7 @@ def open_console(
 
     window = Console(_scenes(scene), theme)
     if bench is not None:
-        window.controls.add_file(bench)
+        window.controls.add_bench(bench)
     window.resize(1600, 1000)
     window.show()
     if child is not None:

@@ -94,11 +94,15 @@ class RunControls(QWidget):
         """Offer a file: a bench if it has instruments, else a scene."""
         text = path.read_text(encoding="utf-8", errors="replace")
         if "[stage]" in text and "[daq]" in text:
-            self.bench.addItem(path.name, str(path))
-            self.bench.setCurrentIndex(self.bench.count() - 1)
+            self.add_bench(path)
         else:
             self.scene.addItem(str(path))
             self.scene.setCurrentIndex(self.scene.count() - 1)
+
+    def add_bench(self, path: Path) -> None:
+        """Offer a bench: a file, or the name of one that ships."""
+        self.bench.addItem(path.name, str(path))
+        self.bench.setCurrentIndex(self.bench.count() - 1)
 
     def enable(self, *, ready: bool, running: bool, commands: bool, holding: bool) -> None:
         """Offer what makes sense now."""
