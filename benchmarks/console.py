@@ -41,7 +41,9 @@ import publisher
 
 from model import Parameters, Substrate
 from rig.console.window import Console
-from rig.link import DIRECTORY_VARIABLE, Link, LinkServer, running
+from rig.link import Link
+from rig.link_address import DIRECTORY_VARIABLE, running
+from rig.link_server import LinkServer
 from rig.live_run import Beside, Live
 from rig.observe import Controls, StepEvent, StepPhase
 from rig.wire import samples_of
@@ -172,7 +174,7 @@ SERVE = """
 import socket, sys, time
 sys.path.insert(0, sys.argv[2])
 import publisher
-from rig.link import LinkServer
+from rig.link_server import LinkServer
 from rig.observe import Controls
 from sequences.frame import Frame
 stage = socket.create_connection(("127.0.0.1", int(sys.argv[1])))

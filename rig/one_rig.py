@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from rig.bench import Bench
 from rig.errors import RigError
-from rig.link import runtime_directory
+from rig.link_address import runtime_directory
 
 
 class InUse(RigError):

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from rig.bench import load_bench
-from rig.link import DIRECTORY_VARIABLE, Link, LinkError, running
+from rig.link import Link
+from rig.link_address import DIRECTORY_VARIABLE, LinkError, running
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase
 from rig.recording import load_recording
 from rig.wire import Samples

@@ -28,7 +28,8 @@ from rig.console.runner import Child, replay_arguments, run_arguments
 from rig.console.theme import THEMES
 from rig.console.window import Console
 from rig.library import shipped
-from rig.link import DIRECTORY_VARIABLE, LinkServer
+from rig.link_address import DIRECTORY_VARIABLE
+from rig.link_server import LinkServer
 from rig.observe import Controls, Event, Wish
 
 WAIT_MS = 30_000

@@ -20,9 +20,11 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import PumpState, PumpStatus, StageStatus
-from rig import link as linking
-from rig import wire
-from rig.link import Address, Link, LinkError, LinkServer
+from rig import link_address as addresses
+from rig import link_server, wire
+from rig.link import Link
+from rig.link_address import Address, LinkError
+from rig.link_server import LinkServer
 from rig.live import Estimate, LivePrediction
 from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan, Wish
 from sequences.frame import Frame
@@ -33,7 +35,7 @@ SAMPLES = 20
 @pytest.fixture(autouse=True)
 def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     directory = tmp_path / "runtime"
-    monkeypatch.setenv(linking.DIRECTORY_VARIABLE, str(directory))
+    monkeypatch.setenv(addresses.DIRECTORY_VARIABLE, str(directory))
     return directory
 
 
@@ -142,14 +144,14 @@ def test_who_attaches_late_sees_the_past_and_several_may_watch() -> None:
             server.frame(frame(number))
         server.step(StepEvent(StepPhase.STARTED, "retract", 1000))
         take_until(first, StepEvent)
-        (address,) = linking.running()
+        (address,) = addresses.running()
         second = Link(address)
         got = take_until(second, StepEvent)
         assert isinstance(got[0], RunInfo)
         assert sum(message.force.size for message in got if isinstance(message, wire.Samples)) == 1000
         first.close()
         second.close()
-    assert linking.running() == []
+    assert addresses.running() == []
 
 
 def test_a_second_run_of_the_same_process_replaces_the_first() -> None:
@@ -235,7 +237,7 @@ def test_the_address_file_is_the_users_alone(runtime: Path) -> None:
         assert json.loads(path.read_text())["port"] == server.address.port
         path.chmod(0o644)
         with pytest.raises(LinkError, match="other users"):
-            linking.running()
+            addresses.running()
     runtime.chmod(0o755)
     with pytest.raises(LinkError, match="other users"):
         LinkServer(Controls())
@@ -247,11 +249,11 @@ def test_a_damaged_address_file_is_named(runtime: Path) -> None:
     path.write_text("{")
     path.chmod(0o600)
     with pytest.raises(LinkError, match=r"run-1\.json is damaged"):
-        linking.running()
+        addresses.running()
 
 
 def test_memory_for_a_console_that_lags_is_bounded_and_the_loss_is_told() -> None:
-    log = linking._Log(1000)
+    log = link_server._Log(1000)
     log.append(b"run", forgettable=False)
     for number in range(100):
         log.append(bytes([number]) * 100, forgettable=True)
@@ -270,7 +272,7 @@ def test_memory_for_a_console_that_lags_is_bounded_and_the_loss_is_told() -> Non
 
 
 def test_the_loops_queue_is_bounded_and_drops_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(linking, "INBOX_FRAMES", 10)
+    monkeypatch.setattr(link_server, "INBOX_FRAMES", 10)
     monkeypatch.setattr(LinkServer, "_pack", lambda self: self._closing.wait())
     with LinkServer(Controls()) as server:
         for number in range(25):
@@ -281,7 +283,8 @@ def test_the_loops_queue_is_bounded_and_drops_the_oldest(monkeypatch: pytest.Mon
 
 CONSOLE = """
 import sys, time
-from rig.link import Link, running
+from rig.link import Link
+from rig.link_address import running
 link = Link(running()[0])
 link.command("claim")
 while not list(link.take()):
@@ -316,7 +319,7 @@ def test_a_frozen_or_killed_console_takes_nothing_from_the_run(harm: signal.Sign
 
 RUN = """
 import sys, time
-from rig.link import LinkServer
+from rig.link_server import LinkServer
 from rig.observe import Controls
 
 class Hung(Controls):
@@ -334,7 +337,7 @@ def test_a_stop_that_is_not_acknowledged_kills_the_run(command: str) -> None:
     with subprocess.Popen([sys.executable, "-c", RUN], stdout=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None
         assert run.stdout.readline() == "serving\n"
-        link = Link(linking.running()[0])
+        link = Link(addresses.running()[0])
         answer = link.emergency_stop() if command == "emergency stop" else link.command("stop")
         assert link.killed
         assert "killed" in answer.text
@@ -343,5 +346,5 @@ def test_a_stop_that_is_not_acknowledged_kills_the_run(command: str) -> None:
         assert not link.emergency_stop().done  # and nobody else is killed
         link.close()
     with pytest.raises(LinkError, match="cannot be reached"):
-        Link(linking.running()[0])
-    assert linking.running() == []
+        Link(addresses.running()[0])
+    assert addresses.running() == []

@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     observers: list[Observer] = [] if arguments.verify else [Terminal()]
     with ExitStack() as links:
         if arguments.link:
-            from rig.link import LinkServer
+            from rig.link_server import LinkServer
 
             observers.append(links.enter_context(LinkServer(controls)))
         began = time.perf_counter()

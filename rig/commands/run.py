@@ -130,7 +130,7 @@ def _run_once(request: Request, arguments: argparse.Namespace, keyboard: Keyboar
     request.observers = observers
     with ExitStack() as links:
         if arguments.link:
-            from rig.link import LinkServer
+            from rig.link_server import LinkServer
 
             observers.append(links.enter_context(LinkServer(request.controls)))
         ending = run_scene(request)

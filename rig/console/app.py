@@ -49,7 +49,7 @@ def open_console(
     application = _application()
     from rig.console.runner import Child
     from rig.console.window import Console
-    from rig.link import running
+    from rig.link_address import running
 
     window = Console(_scenes(scene), theme)
     if bench is not None:

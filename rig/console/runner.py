@@ -10,7 +10,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from rig.link import NAME_VARIABLE, Address, find
+from rig.link_address import Address, find
+from rig.link_server import NAME_VARIABLE
 
 _TAIL = 2000
 

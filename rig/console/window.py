@@ -46,7 +46,8 @@ from rig.console.theme import THEMES, Theme, style_sheet
 from rig.console.timing import durations, time_left, time_to_pull_off
 from rig.console.words import duration, number
 from rig.errors import RigError
-from rig.link import Address, Answer, Link, LinkError, running
+from rig.link import Answer, Link
+from rig.link_address import Address, LinkError, running
 from rig.observe import Event, RunInfo
 
 REFRESH_MS = 33
