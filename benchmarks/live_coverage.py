@@ -23,8 +23,9 @@ from drivers.emulated.plant import Plant
 from drivers.emulated.truth import Truth
 from rig.emulation import truth as specimen_of
 from rig.library import load_scene, shipped
-from rig.live import LivePrediction, LivePredictor
+from rig.live import LivePredictor
 from rig.live_data import Evidence, Gathering, Glance
+from rig.live_prediction import LivePrediction
 from rig.observe import StepEvent, StepPhase
 from rig.scene import Scene
 

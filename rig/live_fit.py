@@ -26,6 +26,8 @@ from rig.live_data import Evidence
 Array = NDArray[np.float64]
 
 BINS = 40
+PRESSURE_NOISE_PA = 5.0
+"""Of a frame's mean."""
 SEAT_M = 30e-6
 """Frames this close to where the rim sits on the substrate are left out: the rim carries them, not the film."""
 
@@ -318,7 +320,7 @@ class _Problem:
         self._force_root = np.linalg.cholesky(self._force_kernel)
         self._pressure_kernel = None
         if self._pressure is not None:
-            self._pressure_kernel = doubt.pressure_shape**2 * same + 5.0**2 * np.eye(self._height.size)
+            self._pressure_kernel = doubt.pressure_shape**2 * same + PRESSURE_NOISE_PA**2 * np.eye(self._height.size)
             self._pressure_root = np.linalg.cholesky(self._pressure_kernel)
 
     def solve(self, start: Mapping[str, float], most: int = 4) -> Fit:

@@ -17,8 +17,9 @@ from queue import SimpleQueue
 from typing import Protocol
 
 from model.parameters import Parameters
-from rig.live import UPDATES, LivePrediction, LivePredictor
+from rig.live import UPDATES, LivePredictor
 from rig.live_data import Gathering, Glance
+from rig.live_prediction import LivePrediction
 from rig.observe import Ending, StepEvent, StepPhase, Watcher
 from sequences.frame import Frame
 

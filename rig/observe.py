@@ -129,7 +129,7 @@ class Observer(Protocol):
         ...
 
     def prediction(self, prediction: Any) -> None:
-        """A live prediction (``rig.live.LivePrediction``)."""
+        """A live prediction (``rig.live_prediction.LivePrediction``)."""
         ...
 
     def finished(self, ending: Ending) -> None:

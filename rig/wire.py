@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import PumpStatus, StageStatus
 from rig.errors import RigError
-from rig.live import LivePrediction
+from rig.live_prediction import LivePrediction
 from rig.observe import Ending, Event, RunInfo, StepEvent
 from sequences.frame import Frame
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.interfaces import PumpState, PumpStatus, StageStatus
 from rig.link_server import LinkServer
-from rig.live import Estimate, LivePrediction
+from rig.live_prediction import Estimate, LivePrediction
 from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan, Wish
 from sequences.frame import Frame
 

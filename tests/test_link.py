@@ -25,7 +25,7 @@ from rig import link_server, wire
 from rig.link import Link
 from rig.link_address import Address, LinkError
 from rig.link_server import LinkServer
-from rig.live import Estimate, LivePrediction
+from rig.live_prediction import Estimate, LivePrediction
 from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan, Wish
 from sequences.frame import Frame
 

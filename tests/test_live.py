@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from model import Gas, Parameters, Substrate, predict
-from rig.live import LivePrediction, LivePredictor
+from rig.live import LivePredictor
 from rig.live_data import GONE, Evidence, Gathering, Glance
 from rig.live_fit import Doubt, Estimator, Kernel, mend
+from rig.live_prediction import LivePrediction
 from rig.live_run import Again, Beside, Inline, live
 from rig.observe import Ending, StepEvent, StepPhase, Watcher
 from rig.session import Request, run_scene

@@ -14,7 +14,7 @@ from drivers.interfaces import PumpState
 from rig.console.story import Moment, Story
 from rig.console.theme import DARK, Theme
 from rig.console.words import condition, fraction, number
-from rig.live import Estimate, LivePrediction
+from rig.live_prediction import Estimate, LivePrediction
 from rig.observe import RunInfo
 
 

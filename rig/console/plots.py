@@ -16,7 +16,7 @@ from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QMenu, QToolButton, Q
 from rig.console.pyramid import Pyramid, polyline
 from rig.console.story import Moment, Story
 from rig.console.theme import Theme
-from rig.live import LivePrediction
+from rig.live_prediction import LivePrediction
 
 Array = NDArray[np.float64]
 

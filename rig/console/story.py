@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import PumpStatus, StageStatus
 from rig.console.pyramid import Pyramid
-from rig.live import LivePrediction
 from rig.live_data import GONE, TOUCH_N
+from rig.live_prediction import LivePrediction
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan
 from rig.wire import Gap, Message, Samples
 
