@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,14 @@ def test_commands_that_predict_take_the_name_of_a_scene_that_ships(words, capsys
     error = capsys.readouterr().err
     assert "scene sphere-61mm: no such file" in error
     assert "sphere-60mm-low" in error
+
+
+@pytest.mark.parametrize(("bench", "pump"), [("emulated", True), ("emulated-gso25", False)])
+def test_the_doctor_examines_a_bench_that_ships_with_what_it_has(bench, pump, capsys):
+    assert main(["doctor", "--bench", bench, "--json"]) == 0
+    seen = {finding["what"] for finding in json.loads(capsys.readouterr().out)}
+    assert {"stage", "force"} <= seen
+    assert ({"pump", "pressure"} <= seen) == pump
 
 
 def test_every_shipped_scene_is_valid_and_runs_on_an_emulated_bench():

@@ -49,7 +49,7 @@ def _emulated(bench: Bench, text: str) -> Iterator[Finding]:
     from rig.safe_state import release
     from rig.session import Request
 
-    scene, scene_text = load_scene("sphere-60mm-low")
+    scene, scene_text = load_scene("sphere-60mm-vented" if None in (bench.pump, bench.pressure) else "sphere-60mm-low")
     request = Request(scene, scene_text, bench, text, Path())
     opened = open_instruments(request)
     try:
