@@ -96,7 +96,7 @@ def acquisition(samples: int, repetitions: int) -> dict[str, float]:
 
 def conversion(samples: int, repetitions: int) -> dict[str, float]:
     record: Calibration = Cell().calibration()
-    cell, sensor = LoadCell.gso("GSO-1K", record), HoneywellHSC(rate=RATE)
+    cell, sensor = LoadCell("GSO-1K", Cell().capacity, record), HoneywellHSC(rate=RATE)
     force, pressure, supply = np.full((3, samples), [[0.4], [2.4], [5.0]])
     return quantiles(lambda: (cell.convert(force), sensor.convert(pressure, supply)), repetitions)
 

@@ -7,7 +7,7 @@ emulated DAQ (``connection="grpc://host:port"``). Only ``drivers.errors`` leave 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -20,11 +20,6 @@ from drivers.errors import BadReply, CommandRefused, DataLost, NoReply, NotConne
 from drivers.interfaces import Identity, Volts
 
 __all__ = ["BridgeChannel", "Channel", "NIDaq", "VoltageChannel", "signal_channel"]
-
-_FILTER_DELAYS: dict[str, Callable[[float], float]] = {
-    # NI 9237 operating instructions: input delay of the delta-sigma filter.
-    "NI 9237": lambda rate: (40 + 5 / 512) / rate + 4.5e-6,
-}
 
 
 class NIDaq:
@@ -81,7 +76,7 @@ class NIDaq:
         try:
             with translated(connection):
                 options = connect(connection, allow_remote, self._deadline, self._resources)
-                self._identity, models = _identify(self._channels, options, expected_model, allow_simulated)
+                self._identity = _identify(self._channels, options, expected_model, allow_simulated)
                 self._task = self._create_task(options, rate, buffer_seconds)
                 self._rate = float(self._task.timing.samp_clk_rate)
             if not (math.isfinite(self._rate) and self._rate > 0):
@@ -89,7 +84,6 @@ class NIDaq:
         except BaseException:
             self.close()
             raise
-        self._delays = {name: _FILTER_DELAYS.get(model, _no_delay)(self._rate) for name, model in models.items()}
 
     @property
     def identity(self) -> Identity:
@@ -110,11 +104,6 @@ class NIDaq:
     def rate(self) -> float:
         """The sample rate the device really uses, Hz."""
         return self._rate
-
-    @property
-    def delays(self) -> dict[str, float]:
-        """By how much each channel lags behind the true signal, s (the delta-sigma filter of a bridge module)."""
-        return dict(self._delays)
 
     def start(self) -> None:
         """Start the sample clock; sample 0 is the first one after this call."""
@@ -235,15 +224,13 @@ class NIDaq:
             ) from error
 
 
-def _identify(
-    channels: Sequence[Channel], options: Any, expected_model: str | None, allow_simulated: bool
-) -> tuple[Identity, dict[str, str]]:
-    """Ask every device what it is and whether it has the inputs; return the first one and each channel's product."""
+def _identify(channels: Sequence[Channel], options: Any, expected_model: str | None, allow_simulated: bool) -> Identity:
+    """Ask every device what it is and whether it has the inputs; return the first one."""
     from nidaqmx.system import System
 
     system = System.remote(options) if options else System.local()
     present = list(system.devices.device_names)
-    models: dict[str, str] = {}
+    models: set[str] = set()
     for channel in channels:
         name = channel.physical.split("/")[0]
         if name not in present:
@@ -253,7 +240,7 @@ def _identify(
                 "plug it in, or correct the physical channel in the bench.",
             )
         device = system.devices[name]
-        models[channel.name] = device.product_type
+        models.add(device.product_type)
         _check_inputs(channel, list(device.ai_physical_chans.channel_names), device.product_type)
         if device.is_simulated and not allow_simulated:
             raise WrongDevice(
@@ -262,15 +249,14 @@ def _identify(
                 "use the real one.",
             )
     first = system.devices[channels[0].physical.split("/")[0]]
-    if expected_model is not None and expected_model not in models.values():
+    if expected_model is not None and expected_model not in models:
         raise WrongDevice(
             "daq",
             f"the bench names {expected_model!r}, {first.name} is {first.product_type!r}.",
             "correct the model in the bench or the device's name in NI MAX.",
         )
     version = ".".join(str(part) for part in system.driver_version)
-    identity = Identity("National Instruments", first.product_type, f"{first.serial_num:08X}", f"NI-DAQmx {version}")
-    return identity, models
+    return Identity("National Instruments", first.product_type, f"{first.serial_num:08X}", f"NI-DAQmx {version}")
 
 
 def _check_inputs(channel: Channel, inputs: list[str], product: str) -> None:
@@ -280,10 +266,6 @@ def _check_inputs(channel: Channel, inputs: list[str], product: str) -> None:
             f"{product} has no analog input {channel.physical!r} (channel {channel.name!r}); it has {inputs}.",
             "correct the physical channel in the bench.",
         )
-
-
-def _no_delay(_rate: float) -> float:
-    return 0.0
 
 
 def _check_arguments(channels: Sequence[Channel], rate: float, buffer_seconds: float, patience: float) -> None:

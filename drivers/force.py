@@ -14,12 +14,6 @@ import numpy as np
 from drivers.calibration import Calibration, InvalidCalibration
 from drivers.flags import Array, Reading, SensorFlags
 
-GRAM_FORCE = 9.80665e-3
-"""N."""
-
-CAPACITIES = {"GSO-25": 25 * GRAM_FORCE, "GSO-500": 500 * GRAM_FORCE, "GSO-1K": 1000 * GRAM_FORCE}
-"""N; the models' names are their capacities in grams."""
-
 _LOADS = ((0.8, SensorFlags.HIGH_LOAD), (1.0, SensorFlags.OVER_RANGE), (1.2, SensorFlags.OVERLOAD))
 
 
@@ -69,27 +63,6 @@ class LoadCell:
         if not self.minimum < self.maximum:
             raise ValueError(f"{self.name}: minimum {self.minimum} is not below maximum {self.maximum}")
         object.__setattr__(self, "_sound", self._find_sound())
-
-    @classmethod
-    def gso(
-        cls,
-        model: str,
-        calibration: Calibration,
-        *,
-        minimum: float = -10.0,
-        maximum: float = 10.0,
-        compression_positive: bool = True,
-    ) -> LoadCell:
-        """Return a GSO-25, GSO-500 or GSO-1K."""
-        if model not in CAPACITIES:
-            raise ValueError(f"load cell model {model!r} is none of {', '.join(CAPACITIES)}")
-        return cls(model, CAPACITIES[model], calibration, minimum, maximum, compression_positive)
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """Lowest and highest force the channel's rails allow, N; a limit outside of it can never be seen."""
-        ends = self._force(np.array([self.minimum, self.maximum]))
-        return float(ends.min()), float(ends.max())
 
     def convert(self, recorded: Array) -> Reading:
         """Return the untared force (n,) in N and what was wrong; sample by sample, so frames may be cut anyhow."""

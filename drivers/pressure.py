@@ -8,13 +8,9 @@ signal's. The average is kept in whole numbers: a stream gives the same bits how
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from datetime import datetime
-
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import SensorFault
 from drivers.flags import Array, Reading, SensorFlags
 
 MILLIBAR = 100.0
@@ -23,8 +19,6 @@ MILLIBAR = 100.0
 FULL_SCALE = 600 * MILLIBAR
 TOTAL_ERROR_BAND = 12 * MILLIBAR
 """1 % of the span of 1200 mbar, 0...50 degC: offset, span and thermal errors."""
-ACCURACY = 3 * MILLIBAR
-"""0.25 % of the span: non-linearity, hysteresis, repeatability."""
 
 CALIBRATED = (0.10, 0.90)
 CLIPPED = (0.025, 0.975)
@@ -45,31 +39,6 @@ Flags = NDArray[np.int64]
 _SLOPE, _MIDDLE = 2.5 * FULL_SCALE, 1.25 * FULL_SCALE  # P = 150 kPa V / Vs - 75 kPa
 
 
-@dataclass(frozen=True, slots=True)
-class AutoZero:
-    """The sensor's reading with port 1 open to the room.
-
-    Attributes
-    ----------
-    offset
-        Pa, subtracted from later readings.
-    noise
-        Standard deviation of the samples averaged, Pa.
-    samples
-        How many there were.
-    temperature
-        degC, or ``None`` if it was not measured.
-    time
-        When, with time zone.
-    """
-
-    offset: float
-    noise: float
-    samples: int
-    temperature: float | None
-    time: datetime
-
-
 class HoneywellHSC:
     """One sensor and its supply; keeps the last 100 ms of both.
 
@@ -84,11 +53,8 @@ class HoneywellHSC:
     quietest
         rms noise of the signal below which an input at 1.398 V is taken for open, V; ``None`` switches the test off.
         A live sensor's own noise is larger than that of the converter alone: measure both on the rig.
-
-    Attributes
-    ----------
     zero
-        The auto-zero being subtracted, or ``None``.
+        What the sensor reads with port 1 open to the room, Pa; it is subtracted.
     """
 
     def __init__(
@@ -98,21 +64,16 @@ class HoneywellHSC:
         rate: float,
         averaging: float = 0.1,
         quietest: float | None = 2e-4,
+        zero: float = 0.0,
     ) -> None:
         window = round(averaging * rate) if averaging >= 0.05 and rate > 0 else 0
         if window < 1:
             raise ValueError(f"{name}: averaging {averaging} s at {rate} Hz; it must be at least 0.05 s and one sample")
         self.name = name
-        self.zero: AutoZero | None = None
         self._quietest = quietest
+        self._middle = _MIDDLE + zero
         self._window = window
         self._supply = _RunningMean(window)
-        self._past_signal = np.empty(0)
-
-    def reset(self) -> None:
-        """Forget the last 100 ms and the zero: a new stream begins."""
-        self.zero = None
-        self._supply.reset()
         self._past_signal = np.empty(0)
 
     def convert(self, signal: Array, supply: Array) -> Reading:
@@ -141,8 +102,7 @@ class HoneywellHSC:
         return past
 
     def _pressure(self, signal: Array, supply: Array) -> Array:
-        offset = 0.0 if self.zero is None else self.zero.offset
-        pressure: Array = signal / supply * _SLOPE - (_MIDDLE + offset)
+        pressure: Array = signal / supply * _SLOPE - self._middle
         return pressure
 
     def _convert_doubtful(self, signal: Array, supply: Array, mean: Array, past: Array) -> Reading:
@@ -166,57 +126,6 @@ class HoneywellHSC:
         quiet[near] = [np.std(window) < self._quietest for window in windows[near]]
         result[-len(windows) :] = quiet
         return result
-
-    def take_zero(
-        self, pressure: Array, *, time: datetime, temperature: float | None = None, steady: float = ACCURACY / 3
-    ) -> AutoZero:
-        """Average readings taken with port 1 open to the room, and subtract them from now on.
-
-        Parameters
-        ----------
-        pressure
-            Pa, (n,), one or two seconds of settled readings, all converted with the present zero.
-        steady
-            Largest rms noise accepted, Pa.
-
-        Raises
-        ------
-        SensorFault
-            The offset is beyond the sensor's total error band, or the readings are not steady: the port is not
-            open, the wire is, or the sensor has been damaged.
-        """
-        present = 0.0 if self.zero is None else self.zero.offset
-        offset, noise = float(np.mean(pressure)) + present, float(np.std(pressure))
-        if not abs(offset) <= TOTAL_ERROR_BAND:
-            raise SensorFault(
-                self.name,
-                f"reads {offset / MILLIBAR:.1f} mbar open to the room; the zero may be off by 12 mbar at most.",
-                "open port 1 to the room; check the signal wire (an open one reads about -330 mbar).",
-            )
-        if not noise <= steady:
-            raise SensorFault(
-                self.name,
-                f"varies by {noise / MILLIBAR:.2f} mbar rms open to the room.",
-                "wait until the pressure has settled, and check the wiring.",
-            )
-        self.zero = AutoZero(offset, noise, len(pressure), temperature, time)
-        return self.zero
-
-
-def responds(before: Array, after: Array, expected: float) -> bool:
-    """Whether the reading followed a change it must follow (a valve, a stroke of the pump).
-
-    The one sure test for an open wire: an open input keeps its believable value.
-
-    Parameters
-    ----------
-    before, after
-        Pa, readings before and after.
-    expected
-        The change it must show, Pa, signed; half of it is enough.
-    """
-    change = float(np.mean(after) - np.mean(before))
-    return change / expected >= 0.5
 
 
 _MEANINGLESS = int(
@@ -275,10 +184,6 @@ class _RunningMean:
 
     def __init__(self, window: int) -> None:
         self._window = window
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._sums = np.zeros(self._window + 1, np.int64)  # of all samples up to each of the last ones
         self._seen = 0
 

@@ -254,13 +254,10 @@ def sensor_converter(bench: Bench, pressure: bool, rate: float) -> SensorConvert
 
 
 def _pressure_sensor(bench: Bench, rate: float) -> HoneywellHSC:
-    from drivers.pressure import AutoZero, HoneywellHSC
+    from drivers.pressure import HoneywellHSC
 
-    sensor = HoneywellHSC(rate=rate)
     zero = bench.pressure.zero if bench.pressure is not None else None
-    if zero is not None:
-        sensor.zero = AutoZero(zero.offset_Pa, zero.noise_Pa, zero.samples, zero.temperature_C, zero.time)
-    return sensor
+    return HoneywellHSC(rate=rate, zero=0.0 if zero is None else zero.offset_Pa)
 
 
 def _connection(device: str, named: str, connections: dict[str, str] | None) -> str:

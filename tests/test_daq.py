@@ -76,13 +76,11 @@ def test_a_usb_device_divides_its_timebase(server: EmulatedDaq, asked: float) ->
         assert 20e6 / daq.rate == pytest.approx(round(20e6 / daq.rate), rel=1e-12)
 
 
-def test_a_bridge_module_runs_faster_than_asked_and_lags(world: SignalWorld) -> None:
+def test_a_bridge_module_runs_faster_than_asked(world: SignalWorld) -> None:
     with EmulatedDaq(world, compact_daq()) as server, connect(server, *CHASSIS_CHANNELS) as daq:
         assert daq.rate == pytest.approx(50e3 / 31)
         daq.read(100)
         assert world.rates == [daq.rate]
-        assert daq.delays["force"] == pytest.approx(24.81e-3, abs=1e-5)
-        assert daq.delays["pressure"] == 0.0
         assert daq.units == ("mV/V", "V", "V")
         # 0.5 N at 0.15 mV/V per N, a zero of 0.4 % of capacity.
         assert daq.read(500)[0].mean() == pytest.approx(0.0809, abs=2e-4)

@@ -28,16 +28,23 @@ from drivers.errors import (
     OutOfRange,
 )
 from drivers.interfaces import Clock, Identity, StageStatus, Volts
+from drivers.stage import (
+    ERROR,
+    LIMITS,
+    MOTION_ERRORS,
+    MOVING,
+    NEGATIVE_LIMIT,
+    ON_TARGET,
+    POSITIVE_LIMIT,
+    REFERENCING,
+    SERVO_ON,
+    STOPPED,
+)
 
 if TYPE_CHECKING:
     from drivers.daq_channels import Channel
 
-STOPPED = 10
-MOTION_ERRORS = (-1024,)
 REMEDY = "this is the emulated bench: look at its fault script"
-
-NEGATIVE_LIMIT, POSITIVE_LIMIT, ERROR, SERVO_ON = 1 << 0, 1 << 2, 1 << 8, 1 << 12
-MOVING, REFERENCING, ON_TARGET = 1 << 13, 1 << 14, 1 << 15
 
 
 def check_wire(world: World, device: str) -> None:
@@ -221,7 +228,7 @@ class DirectStage:
         """Raise what the operator must know, as ``drivers.stage`` does."""
         if error in MOTION_ERRORS or (error == STOPPED and not self._stop_pressed):
             self._motion_error = error
-        self._limits_seen = word & (NEGATIVE_LIMIT | POSITIVE_LIMIT)
+        self._limits_seen = word & LIMITS
         if word & REFERENCING:
             self._limits_accepted = self._limits_seen
         if self._servo_expected and not word & SERVO_ON:
@@ -318,14 +325,6 @@ class DirectDaq:
     def rate(self) -> float:
         """The sample rate the device really uses, Hz."""
         return self._rate
-
-    @property
-    def delays(self) -> dict[str, float]:
-        """By how much each channel lags behind the true signal, s."""
-        return {
-            name: self._device.module(wanted.physical).filter_samples / self._rate
-            for name, wanted in zip(self._names, self._inputs, strict=True)
-        }
 
     def start(self) -> None:
         """Start the sample clock."""
