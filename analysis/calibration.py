@@ -13,37 +13,22 @@ STANDARD_GRAVITY = 9.80665
 """m/s^2; use the local value where it is known, it differs by up to 0.3 %."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class LineFit:
-    """A straight line with its covariance.
+    """A straight line y = slope x + intercept.
 
     Attributes
     ----------
-    slope, intercept
-        y = slope x + intercept.
-    covariance
-        (2, 2), of slope and intercept.
-    residual
-        (n,), y minus line.
+    slope, slope_uncertainty, intercept
+        The uncertainty is a standard one.
     scatter
         Standard deviation of the residuals (n - 2): with their size, the linearity.
     """
 
     slope: float
+    slope_uncertainty: float
     intercept: float
-    covariance: Array
-    residual: Array
     scatter: float
-
-    @property
-    def slope_uncertainty(self) -> float:
-        """Standard uncertainty of the slope."""
-        return float(np.sqrt(self.covariance[0, 0]))
-
-    @property
-    def intercept_uncertainty(self) -> float:
-        """Standard uncertainty of the intercept."""
-        return float(np.sqrt(self.covariance[1, 1]))
 
 
 def fit_line(x: Array, y: Array) -> LineFit:
@@ -58,10 +43,10 @@ def fit_line(x: Array, y: Array) -> LineFit:
         raise AnalysisError(f"{x.size} points over a range of {float(np.ptp(x)) if x.size else 0:g}: no line to fit")
     design = np.stack([x, np.ones_like(x)], axis=1)
     solution, _, _, _ = np.linalg.lstsq(design, y, rcond=None)
-    residual = np.asarray(y - design @ solution, dtype=np.float64)
+    residual = y - design @ solution
     variance = float(residual @ residual) / (x.size - 2)
-    covariance = np.asarray(np.linalg.inv(design.T @ design) * variance, dtype=np.float64)
-    return LineFit(float(solution[0]), float(solution[1]), covariance, residual, float(np.sqrt(variance)))
+    spread = float(np.linalg.inv(design.T @ design)[0, 0]) * variance
+    return LineFit(float(solution[0]), float(np.sqrt(spread)), float(solution[1]), float(np.sqrt(variance)))
 
 
 @dataclass(frozen=True, slots=True)

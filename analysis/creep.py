@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.numerics import Array, block_means
+from analysis.numerics import RECTANGULAR, Array, block_means
 
 CELLS_PER_SECOND = 20.0
 """The force is averaged into so many cells a second; creep is slower."""
@@ -162,4 +162,4 @@ def _judged(tries: list[_Try]) -> tuple[float, float, float] | None:
         as_good = [t.both.share for t in tries if t.both.misfit < together.both.misfit + SIGNIFICANT**2]
         return together.both.share, float(np.hypot(together.both.uncertainty, np.std(as_good))), together.tau
     most = min(rest.share, max(free.share, 0.0) + 2 * free.uncertainty)
-    return (0.0, most / 3**0.5, apart.tau) if most > 0 else None
+    return (0.0, most / RECTANGULAR, apart.tau) if most > 0 else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from analysis.numerics import Array, Noise, fit_around, on_grid, running_mean
 ContactMethod = Callable[[Array, Array, float], int]
 """(depth, force, noise of one point) -> index of contact. Depth rises towards the sample."""
 
-CONTACT_METHODS: dict[str, tuple[str, ContactMethod]] = {}
+CONTACT_METHODS: dict[str, ContactMethod] = {}
 POINTS = 1500
 FEWEST_FOR_LINE = 8
 """Cells before contact that show a drift; fewer show noise."""
@@ -23,7 +23,7 @@ def contact_method(name: str) -> Callable[[ContactMethod], ContactMethod]:
     """Register a contact-point method; its docstring is its algorithm."""
 
     def register(function: ContactMethod) -> ContactMethod:
-        CONTACT_METHODS[name] = ((function.__doc__ or "").strip(), function)
+        CONTACT_METHODS[name] = function
         return function
 
     return register
@@ -123,7 +123,7 @@ def cumulative_sum(depth: Array, force: Array, sigma: float) -> int:
 def contact(work: Extraction) -> Details:
     """Find the contact by every registered method on the same curve; the median counts, the spread is reported."""
     depth, force, sigma = _approach_curve(work)
-    found = {name: -float(depth[method(depth, force, sigma)]) for name, (_, method) in CONTACT_METHODS.items()}
+    found = {name: -float(depth[method(depth, force, sigma)]) for name, method in CONTACT_METHODS.items()}
     places = np.array(list(found.values()))
     work.methods["contact_height_m"] = found
     work.set(contact_height_m=float(np.median(places)), contact_spread_m=float(places.std(ddof=1)))
@@ -210,8 +210,3 @@ def _largest(force: Array, index: int, right: int, noise: Noise) -> tuple[float,
     fit = fit_around(-force, index, index, right, noise, degree=2)
     place, value = fit.minimum()
     return place, -value
-
-
-def contact_methods() -> Mapping[str, str]:
-    """Return the registered contact-point methods with their algorithms."""
-    return {name: text for name, (text, _) in CONTACT_METHODS.items()}

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+RECTANGULAR = 3**0.5
+"""Half-width of a rectangular distribution over its standard deviation."""
+
 BLOCKS = 48
 """A window is averaged into about this many blocks before a fit: fast, and it makes the test of fit sharp."""
 

@@ -114,7 +114,7 @@ def tare(work: Extraction) -> Details:
         work.detached = _rough_detachment(work, running_mean(force, width), level, noise.of_mean(width))
     after = _after_detachment(work, margin)
     windows = [before] if after is None else [before, after]
-    work.baseline = fit_line(force, windows)
+    work.baseline = fit_baseline(force, windows)
     work.force = force - work.baseline(np.arange(force.size, dtype=np.float64))
     residual = np.concatenate([_without_trend(force[slice(*window)]) for window in windows])
     work.noise = Noise.measure(residual, memory)
@@ -180,7 +180,7 @@ def _contact_onset(work: Extraction, smooth: Array, level: float, noise: Noise) 
     if snaps and window[0] + snaps[0].start < certain:
         return window[0] + snaps[0].start
     before = (work.windows.free[0], max(work.windows.free[1], certain - ahead))
-    line = fit_line(work.run.force, [before])
+    line = fit_baseline(work.run.force, [before])
     places = np.arange(before[0], certain, dtype=np.float64)
     quiet = np.flatnonzero(np.abs(smooth[before[0] : certain] - line(places)) < 5 * sigma)
     return before[0] + int(quiet[-1]) if quiet.size else certain
@@ -208,7 +208,7 @@ def _after_detachment(work: Extraction, margin: int) -> tuple[int, int] | None:
     return (start, work.windows.end) if work.windows.end - start >= margin else None
 
 
-def fit_line(force: Array, windows: list[tuple[int, int]], degree: int = 1) -> np.polynomial.Polynomial:
+def fit_baseline(force: Array, windows: list[tuple[int, int]], degree: int = 1) -> np.polynomial.Polynomial:
     """Fit block means by least squares; every part of the record counts by its length."""
     places, means = [], []
     for start, stop in windows:

@@ -14,7 +14,7 @@ import numpy as np
 
 from analysis.extraction import Extraction, extract
 from analysis.numerics import Array, Noise
-from analysis.preparation import fit_line
+from analysis.preparation import fit_baseline
 from analysis.run import Run
 
 DRAWS = 16
@@ -95,7 +95,7 @@ def _drift_excess(work: Extraction) -> float:
         return abs(float(work.baseline.deriv()(0.0))) * (work.windows.end - work.contact_start) / 2
     (_, left), (right, _) = windows
     middle = np.linspace(left, right, 9)
-    bend = fit_line(work.force, windows, degree=3)(middle)
+    bend = fit_baseline(work.force, windows, degree=3)(middle)
     drift = float(work.baseline(right) - work.baseline(left))
     return float(np.sqrt(np.mean(bend**2) + (0.25 * drift) ** 2))
 

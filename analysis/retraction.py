@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from analysis.errors import FeatureMissing
 from analysis.extraction import CONTACT_TESTS, SMOOTHING, Details, Extraction, extraction_step
-from analysis.numerics import Array, ForceJump, LocalFit, Noise, find_jumps, fit_around, fit_window, running_mean
+from analysis.numerics import RECTANGULAR, Array, ForceJump, LocalFit, find_jumps, fit_around, fit_window, running_mean
 from analysis.preparation import require_adhesion
 
 
@@ -88,8 +90,8 @@ def jumps(work: Extraction) -> Details:
     width = work.samples(SMOOTHING, least=4)
     tension = -float(running_mean(work.force[start:stop], width).min())
     reach = min(work.windows.end, stop + 8 * width)
-    shifted = find_jumps(work.force[start:reach], work.noise, width, 0.01 * tension)
-    work.jumps = [type(j)(j.start + start, j.stop + start, j.before, j.after, j.slope_before) for j in shifted]
+    found = find_jumps(work.force[start:reach], work.noise, width, 0.01 * tension)
+    work.jumps = [replace(jump, start=jump.start + start, stop=jump.stop + start) for jump in found]
     work.set(jumps_count=float(len(work.jumps)))
     if work.jumps:
         work.set(largest_jump_N=max((jump.size for jump in work.jumps), key=abs))
@@ -151,7 +153,7 @@ def _held(work: Extraction, last: int) -> tuple[float, float]:
     seen, fall = float(work.force[last]), float(work.force[last] - work.force[last - 1])
     left = min(seen + 2 * fall, 0.0)
     if work.run.protocol != "indentation":
-        return left, abs(left - seen) / 3**0.5
+        return left, abs(left - seen) / RECTANGULAR
     before = float(work.force[last - 1] - work.force[last - 4]) / 3
     growth = (fall - before - 3 * work.noise.sigma) / fall if fall > 0 else 0.0  # two deviations of that difference
     held = left * (1 - min(max(growth, 0.0), 1.0))
@@ -379,8 +381,3 @@ def stress(work: Extraction) -> Details:
     radius = min(gripper.effective_radius, (parameters.substrate.diameter or np.inf) / 2)
     work.set(adhesion_stress_Pa=work.values["pull_off_force_N"] / (np.pi * radius**2))
     return {"decision": f"A_c = {np.pi * radius**2 * 1e4:.3f} cm²"}
-
-
-def noise_of(signal: Array, memory: int) -> Noise:
-    """Measure the noise of a slowly varying signal from its second differences."""
-    return Noise.measure(np.asarray(np.diff(signal, 2) / np.sqrt(6.0), dtype=np.float64), memory)

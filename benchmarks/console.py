@@ -49,8 +49,6 @@ from rig.observe import Controls, StepEvent, StepPhase
 from rig.wire import samples_of
 from sequences.frame import Frame
 
-FRAMES_PER_SECOND = 1000
-
 
 def quantiles(values: list[float], scale: float = 1e3) -> dict[str, float]:
     return {name: float(np.quantile(values, q) * scale) for name, q in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))}

@@ -66,11 +66,6 @@ def work_of_adhesion_jkr(pull_off_force: float, radius: float) -> float:
     return 2 * pull_off_force / (3 * math.pi * _positive(radius, "radius"))
 
 
-def work_of_adhesion_dmt(pull_off_force: float, radius: float) -> float:
-    """Return w = F / (2 pi R), J/m^2."""
-    return pull_off_force / (2 * math.pi * _positive(radius, "radius"))
-
-
 def pull_off_force_jkr(work_of_adhesion: float, radius: float) -> float:
     """Return F = 3/2 pi R w, N."""
     return 1.5 * math.pi * _positive(radius, "radius") * work_of_adhesion

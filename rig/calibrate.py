@@ -25,12 +25,6 @@ if TYPE_CHECKING:
 
 SectionType = TypeVar("SectionType", bound=Section)
 
-RECTANGULAR = 3**-0.5
-"""Standard uncertainty of a rectangular distribution over its half-width."""
-
-LARGEST_ZERO = 1200.0
-"""Pa: a larger zero is outside the Honeywell HSC's 1 % total error band (HSC series data sheet)."""
-
 
 @dataclass(frozen=True)
 class Calibration:
@@ -70,12 +64,13 @@ def calibrate(recording: Recording) -> Calibration | None:
 def dead_weights(recording: Recording) -> Calibration:
     """Fit force against volts: F = slope * reading + intercept, a hung mass pulling with -m g."""
     from analysis.calibration import calibrate_load_cell
+    from analysis.numerics import RECTANGULAR
 
     protocol = _section(recording, DeadWeightsSection)
     masses, readings = _weighed(recording, protocol)
     if len(np.unique(masses)) < 3:
         raise _too_short(recording, f"{len(np.unique(masses))} different masses were weighed; at least 3 are needed")
-    tolerance = protocol.mass_tolerance_percent * 1e-2 * RECTANGULAR
+    tolerance = protocol.mass_tolerance_percent * 1e-2 / RECTANGULAR
     gravity = protocol.gravity_m_s2
     fit = calibrate_load_cell(-masses, readings, mass_uncertainty=tolerance, gravity=gravity)
     force = recording.bench.force
@@ -198,6 +193,7 @@ def pressure_zero(recording: Recording) -> Calibration:
     """Average the reading with the port open; the zero the bench file has already is added back."""
     from analysis.calibration import pressure_zero as average
     from analysis.numerics import running_mean
+    from drivers.pressure import TOTAL_ERROR_BAND
 
     step = next((s for s in recording.step_table() if s.name == "zero" and s.outcome == "done"), None)
     if step is None or recording.pressure is None or recording.bench.pressure is None:
@@ -206,10 +202,10 @@ def pressure_zero(recording: Recording) -> Calibration:
     present = 0.0 if zero is None else zero.offset_Pa
     pressure = recording.pressure[step.start : step.stop] + present
     offset, uncertainty = average(pressure, recording.rate)
-    if abs(offset) > LARGEST_ZERO:
+    if abs(offset) > TOTAL_ERROR_BAND:
         raise FileError(
             f"{recording.path}: the sensor reads {offset:+.0f} Pa open to the room; the zero may be off by "
-            f"{LARGEST_ZERO:g} Pa at most. Remedy: check that the port is open, then the sensor and its wiring."
+            f"{TOTAL_ERROR_BAND:g} Pa at most. Remedy: check that the port is open, then the sensor and its wiring."
         )
     noise, samples = float(pressure.std(ddof=1)), pressure.size
     time = np.arange(samples) / recording.rate

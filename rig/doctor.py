@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import DeviceError
 from drivers.interfaces import Daq
+from drivers.pressure import SUPPLY, TOTAL_ERROR_BAND
 from rig.bench import EMULATED, Bench
 from rig.instruments import Opened, channel_names, open_daq, open_pump, open_stage, sensor_converter
 from rig.one_rig import Claim, InUse
@@ -164,9 +165,8 @@ def _signals(daq: Daq, bench: Bench, pressure: bool) -> Iterator[Finding]:
         "force", True, f"{force.mean():+.5f} N, noise {force.std() * 1e3:.3f} mN rms ({_volts(rows['force'])})"
     )
     if gauge is not None:
-        yield Finding(
-            "supply", bool(4.75 <= rows["supply"].mean() <= 5.25), _volts(rows["supply"]), "check the 5 V supply"
-        )
+        supply = rows["supply"]
+        yield Finding("supply", bool(SUPPLY[0] <= supply.mean() <= SUPPLY[1]), _volts(supply), "check the 5 V supply")
         yield _zero(gauge, rows["pressure"])
     try:
         converter.check()
@@ -176,7 +176,7 @@ def _signals(daq: Daq, bench: Bench, pressure: bool) -> Iterator[Finding]:
 
 def _zero(gauge: Array, volts: Array) -> Finding:
     seen = f"{gauge.mean():+.1f} Pa, noise {gauge.std():.1f} Pa rms ({_volts(volts)})"
-    well = bool(abs(gauge.mean()) <= 1200)
+    well = bool(abs(gauge.mean()) <= TOTAL_ERROR_BAND)
     return Finding("pressure", well, seen, "open the chamber to the room; an open wire reads about -33 kPa")
 
 

@@ -131,7 +131,7 @@ def test_every_contact_method_finds_contact_with_and_without_snap_in(name: str, 
     force = np.where(depth > 0, snap_in + 1500.0 * inside + 1e5 * inside**2, 0.0) + generator.normal(
         0, 2e-4, depth.size
     )
-    found = CONTACT_METHODS[name][1](depth, force, 2e-4)
+    found = CONTACT_METHODS[name](depth, force, 2e-4)
     assert depth[found] == pytest.approx(0.0, abs=12e-6)
 
 
