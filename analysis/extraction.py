@@ -10,6 +10,7 @@ is adding one function:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from analysis.creep import Creep
 from analysis.errors import FeatureMissing
-from analysis.numerics import Array, ForceJump, LocalFit, Noise, block_means
+from analysis.numerics import Array, ForceJump, Noise, block_means
 from analysis.run import Run
 
 MODULES = ("preparation", "loading", "retraction", "indentation", "chamber")
@@ -46,6 +47,7 @@ class Windows:
 class Extraction:
     """One pass over one run. Steps set the attributes; those that follow read them.
 
+    Sample indices (``zero``, ``release``, ``peak``) and separations are ``nan`` until they are found.
     ``creep`` may be given by an earlier pass; ``looks_for_creep`` is false then.
     """
 
@@ -66,14 +68,13 @@ class Extraction:
     separation: Array = field(init=False)
     contact_start: int = field(init=False)
     jumps: list[ForceJump] = field(init=False, default_factory=list)
-    zero: float = field(init=False)
-    zero_separation: float = field(init=False)
-    release: float = field(init=False)
-    release_separation: float = field(init=False)
+    zero: float = field(init=False, default=math.nan)
+    zero_separation: float = field(init=False, default=math.nan)
+    release: float = field(init=False, default=math.nan)
+    release_separation: float = field(init=False, default=math.nan)
     recoil: float = field(init=False, default=0.0)
-    peak: float = field(init=False)
-    peak_fit: LocalFit = field(init=False)
-    peak_shift: float = field(init=False)
+    peak: float = field(init=False, default=math.nan)
+    peak_shift: float = field(init=False, default=math.nan)
 
     def set(self, **values: float) -> None:
         """Store features by their registered names."""
@@ -117,12 +118,8 @@ class Extraction:
         light.force, light.separation = block_means(self.force, length), block_means(self.separation, length)
         light.noise, light.baseline = replace(self.noise, residual=np.empty(0)), self.baseline
         light.contact_start = self.contact_start // length
-        for name in ("zero", "release", "peak"):
-            if hasattr(self, name):
-                setattr(light, name, getattr(self, name) / length)
-        for name in ("zero_separation", "release_separation"):
-            if hasattr(self, name):
-                setattr(light, name, getattr(self, name))
+        light.zero, light.release, light.peak = self.zero / length, self.release / length, self.peak / length
+        light.zero_separation, light.release_separation = self.zero_separation, self.release_separation
         return light
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.derived import validity
 from analysis.errors import FeatureMissing
 from analysis.extraction import Details, Extraction, extraction_step
 from analysis.numerics import Array, block_means
-from analysis.quantities import validity
 from analysis.run import Run
 from model import jkr
 
@@ -272,7 +272,7 @@ def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float
 
 @extraction_step(
     "contact models",
-    title="JKR, DMT and Maugis beside S13",
+    title="JKR and DMT beside S13",
     after=("work of adhesion", "detachment"),
     protocols=("indentation",),
     once=True,

@@ -192,7 +192,6 @@ def pull_off(work: Extraction) -> Details:
     index, left, right = _side_of_jump(work, index, left, right)
     fit = fit_around(work.force, index, left, right, work.noise)
     work.peak, value = fit.minimum()
-    work.peak_fit = fit
     at_jump = any(abs(work.peak - jump.start) <= 1 for jump in work.jumps)
     bias = abs(fit.slope(work.peak)) / 2 if at_jump else abs(fit.curvature(work.peak)) / 24
     separation = work.at(work.run.height, work.peak) + work.run.sensors.compliance * value
@@ -309,18 +308,13 @@ def pressure(work: Extraction) -> Details:
     residual = np.asarray(signal[slice(*window)] - line(places), dtype=np.float64)
     work.set(initial_pressure_Pa=float(line(start)), pressure_noise_Pa=float(residual.std()))
     half = work.samples(0.05, least=1)
-    for name, index in (("pull_off", getattr(work, "peak", None)), ("detachment", getattr(work, "release", None))):
-        if index is None:
+    for name, end in (("pull_off", work.peak + half), ("detachment", work.release)):
+        if np.isnan(end):
             work.missing[f"pressure_at_{name}_Pa"] = f"no {name.replace('_', '-')}"
-        elif name == "detachment":
-            work.values[f"pressure_at_{name}_Pa"] = _before(signal, int(index), half)
         else:
-            work.values[f"pressure_at_{name}_Pa"] = float(signal[int(index) - half : int(index) + half].mean())
+            last = max(1, int(end))
+            work.values[f"pressure_at_{name}_Pa"] = float(signal[max(0, last - 2 * half) : last].mean())
     return {"decision": f"line over {length / work.run.rate:.2g} s before the retraction", "window": window}
-
-
-def _before(signal: Array, index: int, half: int) -> float:
-    return float(signal[max(0, index - 2 * half) : max(1, index)].mean())
 
 
 @extraction_step(
@@ -354,7 +348,7 @@ def gas_work(work: Extraction) -> Details:
     else:
         work.missing["pump_work_J"] = reason
     start, stop = work.retraction()
-    last = int(getattr(work, "release", stop - 1))
+    last = stop - 1 if np.isnan(work.release) else int(work.release)
     gas = running_mean(run.pressure[start : last + 1], work.samples(SMOOTHING, least=1))
     work.set(gas_work_J=float(np.trapezoid(gas, volume * (atmosphere + gas[0]) / (atmosphere + gas))))
     return {"decision": "pump volume recorded" if run.pump_volume is not None else "volume from Boyle's law"}

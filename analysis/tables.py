@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from analysis.quantities import adhesion_efficiency, adhesion_stress, enhancement_ratio, full_contact_area
+from analysis.derived import adhesion_efficiency, adhesion_stress, enhancement_ratio, full_contact_area
 from analysis.quantity import Quantity, with_uncertainty
 from analysis.repeats import Group, Pooled
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from analysis import FeatureMissing, Run, Sensors, analyze
-from analysis.indentation import fit_contact
-from analysis.quantities import (
+from analysis.derived import (
     adhesion_efficiency,
     adhesion_stress,
     enhancement_ratio,
@@ -17,6 +16,7 @@ from analysis.quantities import (
     validity,
     work_of_adhesion,
 )
+from analysis.indentation import fit_contact
 from analysis.quantity import Quantity
 from analysis.synthetic import Experiment, Imperfections, Profile, pull_off_run
 from model import jkr
