@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,72 +26,18 @@ class EndOfRecording(Exception):
 
 
 class Pace:
-    """How fast a replay goes, from any thread: ``speed`` in times real time, ``math.inf`` as fast as possible."""
+    """How fast a replay goes: ``speed`` in times real time, ``math.inf`` as fast as possible."""
 
     def __init__(self, speed: float = math.inf) -> None:
-        self._changed = threading.Condition()
         self._speed = speed
-        self._paused = False
-        self._steps = 0
-        self._target = 0
-        self._clock = 0.0
-        self._sample_time = 0.0
-
-    @property
-    def paused(self) -> bool:
-        """Whether the replay waits."""
-        return self._paused
-
-    @property
-    def speed(self) -> float:
-        """Times real time."""
-        return self._speed
-
-    def set_speed(self, speed: float) -> None:
-        """Change the speed of the running replay."""
-        with self._changed:
-            self._speed = speed
-            self._clock = 0.0
-            self._changed.notify_all()
-
-    def pause(self) -> None:
-        """Wait before the next frame."""
-        with self._changed:
-            self._paused = True
-
-    def play(self) -> None:
-        """Go on."""
-        with self._changed:
-            self._paused, self._clock = False, 0.0
-            self._changed.notify_all()
-
-    def step(self) -> None:
-        """Let one more frame pass while paused."""
-        with self._changed:
-            self._steps += 1
-            self._changed.notify_all()
-
-    def jump(self, sample: int) -> None:
-        """Go as fast as possible up to this sample."""
-        with self._changed:
-            self._target, self._clock = sample, 0.0
-            self._changed.notify_all()
+        self._begin: float | None = None
 
     def wait(self, sample: int, rate: float) -> None:
         """Block until the frame that ends at ``sample`` is due."""
-        with self._changed:
-            while self._paused and self._steps == 0 and sample > self._target:
-                self._changed.wait()
-            self._steps = max(0, self._steps - 1) if self._paused else 0
-            if self._paused or sample <= self._target or math.isinf(self._speed):
-                self._clock = 0.0
-                return
-            now = time.perf_counter()
-            if self._clock == 0.0:
-                self._clock, self._sample_time = now, sample / rate
-            due = self._clock + (sample / rate - self._sample_time) / self._speed
-            if due > now:
-                self._changed.wait(due - now)
+        now, due = time.perf_counter(), sample / rate / self._speed
+        if self._begin is None:
+            self._begin = now - due
+        time.sleep(max(0.0, self._begin + due - now))
 
 
 class ReplayedDaq:
