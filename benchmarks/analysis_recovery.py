@@ -34,8 +34,8 @@ from drivers.emulated.truth import Truth
 from model.jkr import work_of_adhesion_jkr
 from rig.bench import Bench, load_bench, parse_bench
 from rig.emulation import truth as emulated_truth
+from rig.measured import load_run, sensors
 from rig.observe import Watcher
-from rig.recording import load_run, sensors
 from rig.scene import Scene, parse_scene
 from rig.session import Request, run_scene
 from sequences.frame import Frame

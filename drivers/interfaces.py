@@ -175,6 +175,11 @@ class Daq(Protocol):
         ...
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the rows of ``read``: V, or mV/V from a bridge."""
+        ...
+
+    @property
     def rate(self) -> float:
         """The sample rate the device really uses, Hz."""
         ...

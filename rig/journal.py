@@ -26,7 +26,7 @@ _PREFIX = struct.Struct("<QI")
 """Length and CRC-32 of what follows."""
 
 KEYS = {"info", "channels", "metadata", "units", "started"}
-"""What a journal begins with: what ``rig.recorder.lay_out`` asks for."""
+"""What a journal begins with: what ``rig.layout.lay_out`` asks for."""
 
 Blocks = dict[str, NDArray[Any]]
 

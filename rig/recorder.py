@@ -7,13 +7,12 @@ program. Layout: ``docs/recording.md``.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,62 +22,19 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.interfaces import PumpState, PumpStatus, StageStatus
+from drivers.interfaces import PumpStatus
 from rig.errors import FileError
 from rig.journal import Journal, sync
+from rig.layout import ENDING, EVENTS, FRAMES, PREDICTIONS, PUMP, PUMP_STATES, STAGE, STEPS, extend, lay_out, pack_stage
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase
 from rig.seal import seal
 from sequences.frame import Frame
 
-FORMAT = "membrane-adhesion-rig recording 1"
 FLUSH_SECONDS = 0.05
 LEAST_ROOM = 16 << 20
 """Free bytes on the disk at which a run ends: enough to finish and close the recording."""
 
-FRAMES = np.dtype([("start", "<i8"), ("samples", "<i4"), ("arrived_s", "<f8")])
-STAGE = np.dtype(
-    [("sent_s", "<f8"), ("received_s", "<f8"), ("position_m", "<f8"), ("flags", "u1"), ("error", "<i4")],
-)
-PUMP = np.dtype(
-    [
-        ("sample", "<i8"),
-        ("sent_s", "<f8"),
-        ("received_s", "<f8"),
-        ("state", "u1"),
-        ("rate_m3_s", "<f8"),
-        ("volume_m3", "<f8"),
-    ]
-)
-STEPS = np.dtype([("sample", "<i8"), ("phase", "S8"), ("name", "S24"), ("outcome", "S200")])
-EVENTS = np.dtype([("sample", "<i8"), ("kind", "S12"), ("text", "S400")])
-PREDICTIONS = np.dtype([("sample", "<i8"), ("json", "S16000")])
-ENDING = np.dtype([("reason", "S400"), ("exit_code", "<i4"), ("samples", "<i8"), ("ended", "S40")])
-
 _NONE = np.empty(0)
-_STAGE_FLAGS = ("moving", "on_target", "servo_on", "negative_limit", "positive_limit")
-_PUMP_STATES = tuple(PumpState)
-
-
-def pack_stage(status: StageStatus) -> tuple[float, float, float, int, int]:
-    """Return one row of the stage's table."""
-    flags = sum(getattr(status, name) << bit for bit, name in enumerate(_STAGE_FLAGS))
-    return status.sent, status.received, status.position, flags, status.error
-
-
-def unpack_stage(row: Any) -> StageStatus:
-    """Return the poll a row of the stage's table holds."""
-    flags = {name: bool(row["flags"] >> bit & 1) for bit, name in enumerate(_STAGE_FLAGS)}
-    return StageStatus(
-        float(row["sent_s"]), float(row["received_s"]), float(row["position_m"]), error=int(row["error"]), **flags
-    )
-
-
-def unpack_pump(row: Any) -> PumpStatus:
-    """Return the poll a row of the pump's table holds."""
-    state = _PUMP_STATES[int(row["state"])]
-    return PumpStatus(
-        float(row["sent_s"]), float(row["received_s"]), state, float(row["rate_m3_s"]), float(row["volume_m3"])
-    )
 
 
 class Recorder:
@@ -90,8 +46,8 @@ class Recorder:
     ----------
     path
         Must not exist: a recording is never overwritten.
-    channels
-        Names of the raw channels, in order.
+    channels, units
+        Names and units of the raw channels, in order.
     metadata
         Texts kept whole beside the data: scene, bench, versions, seed, place, start of the process.
     journalled
@@ -108,8 +64,8 @@ class Recorder:
         path: Path,
         info: RunInfo,
         channels: tuple[str, ...],
+        units: tuple[str, ...],
         metadata: Mapping[str, str],
-        units: str = "V",
         *,
         journalled: bool = False,
     ) -> None:
@@ -125,7 +81,7 @@ class Recorder:
             "info": asdict(info),
             "channels": list(channels),
             "metadata": dict(metadata),
-            "units": units,
+            "units": list(units),
             "started": datetime.now(UTC).isoformat(),
         }
         try:
@@ -170,11 +126,6 @@ class Recorder:
         now = datetime.now(UTC).isoformat()
         self._put("ending", _row(ENDING, ending.reason, ending.exit_code, ending.samples, now))
 
-    @property
-    def age(self) -> float:
-        """Seconds since the last flush."""
-        return time.perf_counter() - self._last_flush
-
     def flush(self) -> None:
         """Write what is pending, hand it to the operating system, and acknowledge it.
 
@@ -218,7 +169,7 @@ class Recorder:
         for frame in frames:
             if frame.pump is not None and frame.pump is not self._last_pump:
                 self._last_pump, pump = frame.pump, frame.pump
-                state = _PUMP_STATES.index(pump.state)
+                state = PUMP_STATES.index(pump.state)
                 yield frame.stop, pump.sent, pump.received, state, pump.rate, pump.volume
 
     def close(self) -> None:
@@ -302,58 +253,6 @@ class Recorder:
             self._pending.setdefault(name, []).append(block)
 
 
-def lay_out(
-    file: h5py.File,
-    info: Mapping[str, Any],
-    channels: Sequence[str],
-    metadata: Mapping[str, str],
-    units: str,
-    started: str,
-) -> dict[str, h5py.Dataset]:
-    """Make every group and dataset of a recording, empty; return the datasets that grow, by name.
-
-    Parameters
-    ----------
-    info
-        A ``RunInfo`` as a dictionary.
-    started
-        When the run began, ISO 8601.
-    """
-    file.attrs.update({"default": "entry", "format": FORMAT})
-    entry = _group(file, "entry", "NXentry", default="data")
-    entry.attrs["title"] = info["title"]
-    entry["title"] = info["title"]
-    entry["start_time"] = started
-    entry["definition"] = FORMAT
-    notes = _group(entry, "configuration", "NXcollection")
-    for name, text in metadata.items():
-        notes[name] = text
-    notes["run"] = json.dumps(info)
-    raw = _group(entry, "raw", "NXcollection")
-    raw.attrs["sample_rate_Hz"] = info["rate"]
-    data = _group(entry, "data", "NXdata", signal="force", axes="time")
-    sets = {
-        "volts": _rows(raw, "volts", np.float64, (len(channels),), 4096, units=units),
-        "frames": _rows(raw, "frames", FRAMES, (), 512),
-        "stage": _rows(raw, "stage", STAGE, (), 512),
-        "time": _rows(data, "time", np.float64, (), 4096, units="s"),
-        "force": _rows(data, "force", np.float64, (), 4096, units="N", long_name="F_r (N), untared"),
-        "height": _rows(data, "height", np.float64, (), 4096, units="m"),
-        "steps": _rows(entry, "steps", STEPS, (), 64),
-        "events": _rows(entry, "events", EVENTS, (), 64),
-        "predictions": _rows(entry, "predictions", PREDICTIONS, (), 8),
-        "ending": _rows(entry, "ending", ENDING, (), 1),
-    }
-    sets["volts"].attrs["channels"] = list(channels)
-    auxiliary = ["height"]
-    if info["uses_pressure"]:
-        sets["pressure"] = _rows(data, "pressure", np.float64, (), 4096, units="Pa", long_name="P_a (Pa), gauge")
-        sets["pump"] = _rows(raw, "pump", PUMP, (), 512)
-        auxiliary.append("pressure")
-    data.attrs["auxiliary_signals"] = auxiliary
-    return sets
-
-
 def _scratch() -> str | None:
     """Return a directory in memory where there is one: the disk may be full."""
     return "/dev/shm" if os.path.isdir("/dev/shm") else None
@@ -362,27 +261,3 @@ def _scratch() -> str | None:
 def _row(table: np.dtype[Any], *values: Any) -> NDArray[Any]:
     cells = tuple(value.encode() if isinstance(value, str) else value for value in values)
     return np.array([cells], table)
-
-
-def _group(parent: h5py.Group, name: str, kind: str, **attributes: str) -> h5py.Group:
-    group = parent.create_group(name)
-    group.attrs.update({"NX_class": kind, **attributes})
-    return group
-
-
-def _rows(
-    parent: h5py.Group, name: str, kind: Any, shape: tuple[int, ...], chunk: int, **attributes: str
-) -> h5py.Dataset:
-    dataset = parent.create_dataset(
-        name, shape=(0, *shape), maxshape=(None, *shape), dtype=kind, chunks=(chunk, *shape), track_times=False
-    )
-    dataset.attrs.update(attributes)
-    return dataset
-
-
-def extend(dataset: h5py.Dataset, block: NDArray[Any]) -> None:
-    """Append rows to a dataset and hand them to the operating system."""
-    size = dataset.shape[0]
-    dataset.resize(size + len(block), axis=0)
-    dataset[size:] = block
-    dataset.flush()

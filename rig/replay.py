@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import Identity, PumpStatus, StageStatus
+from rig.layout import unpack_pump, unpack_stage
 from rig.observe import Controls, Event, StepEvent, StepPhase, Wish
-from rig.recorder import unpack_pump, unpack_stage
 from rig.recording import Recording
 from sequences.frame import Frame
 
@@ -53,6 +53,11 @@ class ReplayedDaq:
     def channels(self) -> tuple[str, ...]:
         """See ``Daq``."""
         return self._recording.channels
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """See ``Daq``."""
+        return self._recording.units
 
     @property
     def rate(self) -> float:

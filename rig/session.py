@@ -28,7 +28,7 @@ from rig.loop import Instruments, Loop, Reporter
 from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
 from rig.protocols import build_steps
 from rig.recorder import Recorder
-from rig.recording import recover
+from rig.recovery import recover
 from rig.safe_state import make_safe, release
 from rig.scene import Scene
 from sequences.errors import StepFailed
@@ -137,7 +137,8 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     steps = build_steps(request.scene, apparatus)
     info = _info(request, opened, steps)
     journalled = request.bench.recording.survives_power_cut
-    recorder = Recorder(request.out, info, opened.daq.channels, _metadata(request), journalled=journalled)
+    daq = opened.daq
+    recorder = Recorder(request.out, info, daq.channels, daq.units, _metadata(request), journalled=journalled)
     reporter.store = recorder
     if request.live:
         add_live_prediction(reporter, request.scene, request.bench, virtual=opened.virtual)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from model import ModelError, predict
 from rig.calibrate import calibrate
-from rig.recording import as_run, load_recording
+from rig.measured import as_run
+from rig.recording import load_recording
 
 if TYPE_CHECKING:
     from analysis.pipeline import Analysis

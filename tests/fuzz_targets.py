@@ -38,8 +38,11 @@ from rig.check import check
 from rig.errors import FileError, Refused
 from rig.fault_script import load_faults
 from rig.journal import _MAGIC, journal_of
+from rig.measured import as_run
 from rig.observe import Controls, Watcher
-from rig.recording import _entry, _load, as_run, load_recording, recover
+from rig.recording import _load, load_recording
+from rig.recording_file import entry_of
+from rig.recovery import recover
 from rig.scene import Scene, parse_scene
 from rig.session import Request, run_scene
 
@@ -294,7 +297,7 @@ def recording_parts(data: bytes) -> None:
             with contextlib.suppress(ValueError, OSError, TypeError, OverflowError):  # no such change is possible
                 _change(file, choices.of(parts), choices)
         try:
-            recording = _load(_entry(file, _sound()), _sound())
+            recording = _load(entry_of(file, _sound()), _sound())
             as_run(recording)
         except FileError as error:
             one_message(error)
@@ -352,7 +355,7 @@ def journal(data: bytes) -> None:
     """A journal whose checksums are right and whose content is not."""
     choices = Choices(data)
     header = {"info": {"pid": -1, "title": "x", "rate": 1000.0, "uses_pressure": True}, "channels": list(NAMES)}
-    header |= {"metadata": {"scene": SCENE, "bench": BENCH, "process_started": "0"}, "units": "V", "started": "now"}
+    header |= {"metadata": {"scene": SCENE, "bench": BENCH, "process_started": "0"}, "units": ["V"], "started": "now"}
     match choices.below(4):
         case 1:
             header[choices.of(list(header))] = choices.of([None, 5, "x", [], {}, choices.number()])
@@ -370,7 +373,7 @@ def journal(data: bytes) -> None:
     prefixed = (struct.pack("<QI", len(record), zlib.crc32(record)) + record for record in records)
     journal_of(path).write_bytes(_MAGIC + b"".join(prefixed)[: -choices.below(20) or None])
     try:
-        with mock.patch("rig.recording.probe"):  # without a journal that can be read, the empty file itself is tried
+        with mock.patch("rig.recovery.probe"):  # without a journal that can be read, the empty file itself is tried
             recover(path)
     except FileError as error:
         one_message(error)

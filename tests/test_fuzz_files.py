@@ -153,7 +153,7 @@ def test_a_damaged_recording_is_read_or_refused(data, recorded, tmp_path):
 @pytest.mark.parametrize("part", ["raw/volts", "raw/frames", "data/force", "configuration/scene", "ending", "steps"])
 @pytest.mark.parametrize("change", ["missing", "kind", "shape"])
 def test_a_recording_with_a_wrong_part_is_refused(part, change, recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.recording.probe", lambda path: None)  # the file is sound HDF5: no process is needed
+    monkeypatch.setattr("rig.recovery.probe", lambda path: None)  # the file is sound HDF5: no process is needed
     path = tmp_path / "wrong.h5"
     path.write_bytes(recorded)
     with h5py.File(path, "r+") as file:
@@ -168,7 +168,7 @@ def test_a_recording_with_a_wrong_part_is_refused(part, change, recorded, tmp_pa
 
 
 def test_a_text_of_a_recording_that_is_many_texts_is_refused(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.recording.probe", lambda path: None)
+    monkeypatch.setattr("rig.recovery.probe", lambda path: None)
     path = tmp_path / "wrong.h5"
     path.write_bytes(recorded)
     with h5py.File(path, "r+") as file:

@@ -16,8 +16,9 @@ from rig.calibrate import calibrate
 from rig.check import check
 from rig.cli import main
 from rig.errors import Refused
+from rig.measured import load_run
 from rig.observe import StepPhase, Watcher
-from rig.recording import load_recording, load_run
+from rig.recording import load_recording
 from rig.scene import parse_scene
 from rig.session import Request, run_scene
 from rig.summary import summarise

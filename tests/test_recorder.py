@@ -5,13 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from unittest.mock import patch
 
 import h5py
 import numpy as np
 import pytest
 
 from rig.errors import BeingWritten, FileError
-from rig.recording import load_recording, open_recording, recover
+from rig.recording import load_recording, open_recording
+from rig.recovery import recover
 from rig.session import run_scene
 
 
@@ -32,6 +34,23 @@ def test_h5py_and_pandas_open_a_recording_without_us(request_for):
         table = pd.DataFrame(entry["raw/stage"][:])
         assert (table.received_s >= table.sent_s).all()
         assert entry["configuration/scene"].asstr()[()] == request.scene_text
+
+
+def test_the_raw_values_of_each_instrument_carry_their_own_unit(request_for):
+    request = request_for("sphere-60mm-low")
+    with patch("drivers.emulated.direct.DirectDaq.units", ("mV/V", "V", "V")):
+        run_scene(request)
+    with h5py.File(request.out) as file:
+        volts = file["entry/raw/volts"]
+        assert volts.attrs["units"] == "mV/V, V"
+        assert dict(zip(volts.attrs["channels"], volts.attrs["channel_units"], strict=True)) == {
+            "force": "mV/V",
+            "pressure": "V",
+            "supply": "V",
+        }
+    with h5py.File(request.out, "r+") as file:
+        del file["entry/raw/volts"].attrs["channel_units"]  # as recorded before there was such a thing
+    assert load_recording(request.out).units == ("V", "V", "V")
 
 
 def test_a_killed_writer_loses_nothing_it_acknowledged(tmp_path):

@@ -49,7 +49,7 @@ def synthetic(name: str) -> Run:
 @pytest.fixture
 def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     """Files that stand for recordings; what they hold comes from ``synthetic``."""
-    monkeypatch.setattr("rig.recording.load_run", lambda path: synthetic(path.stem))
+    monkeypatch.setattr("rig.measured.load_run", lambda path: synthetic(path.stem))
     monkeypatch.setattr("rig.recording.protocol_of", lambda path: "pull_off")
     paths = [tmp_path / f"{name}.h5" for name in ("first", "second", "aborted")]
     for path in paths:

@@ -13,8 +13,9 @@ from drivers.emulated.faults import Fault, Faults
 from drivers.errors import NotConnected
 from rig.bench import parse_bench
 from rig.errors import FileError, Refused
+from rig.measured import load_run
 from rig.observe import Controls, StepPhase, Watcher
-from rig.recording import load_recording, load_run
+from rig.recording import load_recording
 from rig.replay import Pace
 from rig.replay_session import replay
 from rig.session import run_scene

@@ -101,7 +101,7 @@ def analyze_files(
 def analyze_file(path: Path, *, model: str = "cone", pictures: bool = False) -> Analyzed:
     """Analyse one recording."""
     from analysis.batch import analyze_run
-    from rig.recording import load_run
+    from rig.measured import load_run
 
     return analyze_run(load_run(path), model=model, pictures=pictures)
 
@@ -180,7 +180,7 @@ def _csv(frame: object, path: Path) -> None:
 def _write_afm(directory: Path, paths: list[Path]) -> None:
     from analysis import analyze
     from analysis.export import write_afm
-    from rig.recording import load_run
+    from rig.measured import load_run
 
     directory.mkdir(parents=True, exist_ok=True)
     for path in paths:

@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Repair each file; say what was kept."""
-    from rig.recording import recover
+    from rig.recovery import recover
 
     for path in arguments.file:
         found = recover(path, force=arguments.force)

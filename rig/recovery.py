@@ -1,0 +1,158 @@
+"""What a crash has left of a recording, made whole: from its journal, or from what can be read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from rig.errors import BeingWritten, FileError
+from rig.journal import journal_of, read_journal, sync, sync_folder
+from rig.layout import ENDING, PER_FRAME, PER_SAMPLE, complete, extend, filled, lay_out
+from rig.recording_file import entry_of, insist, opened, reading
+from rig.seal import is_sealed, probe, seal
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What ``recover`` found: samples and frames kept, and whether anything had to be done."""
+
+    path: Path
+    samples: int
+    frames: int
+    repaired: bool
+
+
+def recover(path: Path, *, force: bool = False) -> Recovery:
+    """Repair a recording left by a crash, so that a plain ``h5py.File(path)`` opens it.
+
+    Where a journal lies beside it the recording is written anew from that. Else the readable content is copied into a
+    new file, which then takes the old one's place; streams that one flush had reached and another not are cut to the
+    last complete frame.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read at all.
+    BeingWritten
+        The program that writes it is still running (``force`` overrides).
+    """
+    insist(path)
+    if not is_sealed(path):
+        rewritten = _rewritten(path, force=force)
+        if rewritten is not None:
+            return rewritten
+        probe(path)
+    with opened(path) as file:
+        if file.swmr_mode and not force and _writer_lives(file):
+            raise BeingWritten(f"recording {path}: is still being written. Remedy: wait for the run to end.")
+        if not file.swmr_mode:
+            with reading(path):
+                return Recovery(path, *complete(entry_of(file, path)), repaired=False)
+    return _repair(path)
+
+
+def _repair(path: Path) -> Recovery:
+    """Copy what is whole in a file with the mark of a writer into a new one."""
+    with _replacing(path) as fresh, opened(path) as file:
+        samples, frames = complete(entry_of(file, path))
+        _copy(file, fresh, samples, frames)
+    return Recovery(path, samples, frames, repaired=True)
+
+
+def _rewritten(path: Path, *, force: bool) -> Recovery | None:
+    """Write a recording anew from its journal; ``None`` if it has none, or its writer lives."""
+    journal = journal_of(path)
+    try:
+        header, records = read_journal(journal)
+    except FileError:
+        return None
+    if not force and _author_lives(header["info"], header["metadata"]):
+        return None
+    with _replacing(path) as fresh, h5py.File(fresh, "w", libver="latest") as file:
+        sets = lay_out(file, **header)
+        for blocks in records:
+            for name, block in blocks.items():
+                extend(sets[name], block)
+        samples, frames = complete(file["entry"])
+        _end(file["entry"], samples)
+    journal.unlink()
+    return Recovery(path, samples, frames, repaired=True)
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Give the name of a new file; once written it is sealed, forced to the disk, and takes the old one's place."""
+    fresh = path.with_name(f".{path.name}.recovering")
+    fresh.unlink(missing_ok=True)
+    try:
+        yield fresh
+        seal(fresh)
+        sync(fresh)
+        os.replace(fresh, path)
+        sync_folder(path)
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
+        fresh.unlink(missing_ok=True)
+        raise FileError(
+            f"recording {path}: cannot be repaired ({error}). It is left as it was. Remedy: free space beside it "
+            "and try again; keep a copy of the file."
+        ) from error
+
+
+def _writer_lives(file: h5py.File) -> bool:
+    """Whether the process that began the recording is still there."""
+    try:
+        info = json.loads(file["entry/configuration/run"].asstr()[()])
+        started = file["entry/configuration/process_started"].asstr()[()]
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeDecodeError):
+        return False
+    return _author_lives(info, {"process_started": started})
+
+
+def _author_lives(info: Any, metadata: Any) -> bool:
+    """Whether the process that began a recording is still there, and no other one has its number."""
+    import psutil
+
+    try:
+        return abs(psutil.Process(int(info["pid"])).create_time() - float(metadata["process_started"])) < 2.0
+    except (psutil.Error, LookupError, TypeError, ValueError, OverflowError):
+        return False
+
+
+def _copy(file: h5py.File, fresh: Path, samples: int, frames: int) -> None:
+    with h5py.File(fresh, "w", libver="latest") as copy:
+        copy.attrs.update(file.attrs)
+        _copy_group(file, copy, samples, frames)
+        _end(copy["entry"], samples)
+
+
+def _end(entry: h5py.Group, samples: int) -> None:
+    """Say that the program died, unless the recording says how it ended."""
+    if not len(entry["ending"]):
+        extend(entry["ending"], np.array([(b"the program died; recovered", -9, samples, b"")], ENDING))
+
+
+def _copy_group(source: h5py.Group, target: h5py.Group, samples: int, frames: int) -> None:
+    for name, item in source.items():
+        if isinstance(item, h5py.Group):
+            group = target.create_group(name)
+            group.attrs.update(item.attrs)
+            _copy_group(item, group, samples, frames)
+            continue
+        where = item.name.removeprefix("/entry/")
+        keep = samples if where in PER_SAMPLE else frames if where in PER_FRAME else None
+        if item.shape == ():
+            copied = target.create_dataset(name, data=item[()], dtype=item.dtype)
+        else:
+            data = item[:keep] if keep is not None else filled(item[:])
+            copied = target.create_dataset(
+                name, data=data, dtype=item.dtype, maxshape=item.maxshape, chunks=item.chunks
+            )
+        copied.attrs.update(item.attrs)
