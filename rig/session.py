@@ -211,7 +211,6 @@ def _loop(
     bench = request.bench
     travel = opened.stage.travel if recorder is not None else (-float("inf"), float("inf"))
     interlocks = Interlocks(limits_of(bench, travel, opened.pump is not None))
-    frame_samples = max(1, round(bench.daq.frame_ms * 1e-3 * opened.daq.rate))
     return Loop(
         instruments,
         opened.converter(),
@@ -219,7 +218,7 @@ def _loop(
         recorder,
         reporter,
         request.controls,
-        frame_samples=frame_samples,
+        frame_samples=bench.daq.frame_samples(opened.daq.rate),
     )
 
 
@@ -271,7 +270,7 @@ def _info(request: Request, opened: Opened, steps: list[Step]) -> RunInfo:
         recording=str(request.out),
         pid=os.getpid(),
         rate=opened.daq.rate,
-        frame_samples=max(1, round(bench.daq.frame_ms * 1e-3 * opened.daq.rate)),
+        frame_samples=bench.daq.frame_samples(opened.daq.rate),
         uses_pressure=opened.pump is not None,
         plan=tuple(StepPlan(step.name, step.condition) for step in steps),
         limits=limits,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rig.bench import load_bench
 from rig.check import reasons
 from rig.console.checks import check_scene
-from rig.library import find_scene
+from rig.library import find
 
 
 def test_a_scene_that_fits_is_ready_and_names_its_steps():
@@ -16,7 +16,7 @@ def test_a_scene_that_fits_is_ready_and_names_its_steps():
 
 
 def test_each_refusal_is_told_once_and_whole(tmp_path):
-    text, _ = find_scene("sphere-60mm-low")
+    text, _ = find("scene", "sphere-60mm-low")
     scene = tmp_path / "a; b: c.toml"
     text = text.replace("60 mm glass sphere", "a; b: c").replace(
         "approach_speed_um_s = 100.0", "approach_speed_um_s = 900.0"

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, cast
 from rig.bench import Bench, load_bench
 from rig.check import needed_ml, reasons, usable_ml
 from rig.errors import RigError
-from rig.library import find_scene
+from rig.library import load_scene
 from rig.protocols import build_steps
-from rig.scene import Scene, parse_scene
+from rig.scene import Scene
 
 if TYPE_CHECKING:
     from sequences.step import Apparatus
@@ -36,7 +36,7 @@ class Checked:
 def check_scene(name: str, bench_path: Path | None) -> Checked:
     """Read scene and bench and hold one against the other. Opens and moves nothing."""
     try:
-        scene = parse_scene(*find_scene(name))
+        scene, _ = load_scene(name)
         bench, _ = load_bench(bench_path)
     except RigError as error:
         return Checked(None, True, (), (str(error),))
