@@ -6,6 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
+from rig.errors import FileError
 from rig.scene import Scene, parse_scene
 
 Kind = Literal["scene", "bench", "campaign"]
@@ -45,3 +46,19 @@ def load_scene(name: str | Path) -> tuple[Scene, str]:
     """
     text, source = find("scene", name)
     return parse_scene(text, source), text
+
+
+def read_text(kind: str, path: Path, otherwise: str = "") -> str:
+    """Read a small UTF-8 text file; ``otherwise`` ends the remedy where there is none.
+
+    Raises
+    ------
+    FileError
+        It does not exist, or cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise FileError(f"{kind} {path}: no such file. Remedy: check the path{otherwise}.") from error
+    except (OSError, ValueError) as error:  # a path may hold what no path can
+        raise FileError(f"{kind} {path}: cannot be read ({error}). Remedy: it must be a UTF-8 text file.") from error
