@@ -1,4 +1,4 @@
-"""The papers' derived quantities with uncertainties: ratio, stress, efficiency, work of adhesion and its validity."""
+"""The papers' derived quantities with uncertainties: ratio, stress, efficiency; and whether S13 is valid."""
 
 from __future__ import annotations
 
@@ -76,16 +76,6 @@ class Validity:
     def holds(self) -> bool:
         """Whether nothing speaks against S13."""
         return not self.remarks
-
-
-def work_of_adhesion(force: Quantity, radius: Quantity) -> Quantity:
-    """Return w = 2 F_off / (3 pi R), J/m^2 (SI Eq. S13)."""
-    value = jkr.work_of_adhesion_jkr(force.value, radius.value)
-    parts = {
-        "force": value * force.uncertainty / abs(force.value),
-        "radius": value * radius.uncertainty / radius.value,
-    }
-    return Quantity(value, math.hypot(*parts.values()), "J/m^2", "2 F_off / (3 π R), SI Eq. S13", parts)
 
 
 def validity(force: float, radius: float, modulus: float, thickness: float, contact_radius: float | None) -> Validity:

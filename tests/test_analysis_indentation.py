@@ -14,7 +14,6 @@ from analysis.derived import (
     enhancement_ratio,
     full_contact_area,
     validity,
-    work_of_adhesion,
 )
 from analysis.indentation import fit_contact
 from analysis.quantity import Quantity
@@ -123,9 +122,6 @@ def test_the_papers_quantities() -> None:
     ratio = enhancement_ratio(force, least)
     assert ratio.value == pytest.approx(2.933, abs=1e-3)
     assert ratio.uncertainty == pytest.approx(ratio.value * np.hypot(0.006 / 0.88, 0.003 / 0.30))
-    work = work_of_adhesion(Quantity(78.04e-3, 1e-3, "N"), Quantity(4e-3, 1e-5, "m"))
-    assert work.value == pytest.approx(4.140, abs=1e-3)
-    assert work.uncertainty == pytest.approx(work.value * np.hypot(1 / 78.04, 1e-5 / 4e-3))
 
 
 def test_validity_by_tabor_and_confinement() -> None:
