@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,6 +24,7 @@ from rig.scene import Scene, Section, Title, parse_scene
 from rig.validation import parsed
 
 JOURNAL = "journal.jsonl"
+MOST_REPEATS = 1000
 
 
 class EntrySection(Section):
@@ -35,7 +36,7 @@ class EntrySection(Section):
     scene: str
     name: Title | None = None
     initial_pressures_kPa: Annotated[tuple[float, ...], Field(min_length=1, strict=False)] | None = None
-    repeats: Annotated[int, Field(ge=1, le=1000)] | None = None
+    repeats: Annotated[int, Field(ge=1, le=MOST_REPEATS)] | None = None
     prompt: str = ""
 
 
@@ -45,7 +46,7 @@ class Campaign(Section):
     title: str
     order: Literal["given", "random"] = "given"
     seed: int = 0
-    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    repeats: Annotated[int, Field(ge=1, le=MOST_REPEATS)] = 1
     test: Annotated[tuple[EntrySection, ...], Field(min_length=1, strict=False)]
 
 
@@ -92,12 +93,25 @@ def load_campaign(path: Path) -> tuple[Campaign, list[PlannedTest]]:
         Names the file, the key, the value and the allowed range.
     """
     campaign = parsed(Campaign, "campaign", *find("campaign", path))
-    return campaign, list(_ordered(campaign, list(_tests(campaign, path.parent))))
+    return campaign, list(_ordered(campaign, _distinct(_tests(campaign, path.parent), f"campaign {path}")))
 
 
 def single(scene: Scene, text: str, stem: str, repeats: int, seed: int) -> list[PlannedTest]:
     """Return the tests of one scene: its places, each so often."""
-    return list(_places(scene, text, stem, repeats, seed, ""))
+    return _distinct(_places(scene, text, stem, repeats, seed, ""), stem)
+
+
+def _distinct(tests: Iterable[PlannedTest], source: str) -> list[PlannedTest]:
+    """Refuse places whose recordings would have one name."""
+    found: dict[str, PlannedTest] = {}
+    for test in tests:
+        if test.key in found:
+            raise FileError(
+                f"{source}: {found[test.key].place!r} and {test.place!r} would both be recorded as {test.key}. "
+                "Remedy: let them differ in letters or digits."
+            )
+        found[test.key] = test
+    return list(found.values())
 
 
 def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
@@ -109,12 +123,12 @@ def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
         name = section.name or Path(source).stem
         stem = f"{number + 1:02d}-{_word(name)}"
         if section.initial_pressures_kPa is None:
-            yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt)
+            yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt, always=True)
             continue
         for pressure in section.initial_pressures_kPa:
             changed, changed_text = _at_pressure(text, name, pressure, f"{source} at {pressure:g} kPa")
             yield from _places(
-                changed, changed_text, f"{stem}_{pressure:+g}kPa", repeats, campaign.seed, section.prompt
+                changed, changed_text, f"{stem}_{pressure:+g}kPa", repeats, campaign.seed, section.prompt, always=True
             )
 
 
@@ -127,13 +141,16 @@ def _at_pressure(text: str, name: str, pressure: float, source: str) -> tuple[Sc
     return parse_scene(changed_text, source), changed_text
 
 
-def _places(scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str) -> Iterator[PlannedTest]:
+def _places(
+    scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str, *, always: bool = False
+) -> Iterator[PlannedTest]:
+    """Yield the tests at each place; ``always`` numbers them even if there is one: more may be asked for later."""
     places: Sequence[str] = getattr(scene.protocol, "positions", ("",))
     repeats = max(repeats, getattr(scene.protocol, "repeats", 1))
     for index, place in enumerate(places):
         hands = prompt if not place else " ".join(filter(None, (prompt, f"Bring the probe over {place}.")))
         for repeat in range(1, repeats + 1):
-            parts = [stem, _word(place), f"{repeat}" if repeats > 1 else ""]
+            parts = [stem, _word(place), f"{repeat}" if always or repeats > 1 else ""]
             key = "-".join(filter(None, parts))
             yield PlannedTest(
                 key=key,
@@ -207,7 +224,10 @@ class Journal:
                 continue
             try:
                 entry = json.loads(line)
-                entries[str(entry["key"])] = {**entry, "recording": str(entry["recording"])}
+                name = str(entry["recording"])
+                if not name or Path(name).name != name:
+                    raise ValueError(f"{name!r} is no file of this folder")
+                entries[str(entry["key"])] = {**entry, "recording": name}
             except (ValueError, KeyError, TypeError) as error:
                 if number == len(lines):
                     continue  # the program died while writing it

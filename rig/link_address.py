@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import sys
 import tempfile
@@ -40,7 +41,10 @@ def runtime_directory() -> Path:
     """
     told = os.environ.get(DIRECTORY_VARIABLE)
     path = Path(told) if told else _default_directory()
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise LinkError(f"link: {path} cannot be made ({error}). Remedy: set {DIRECTORY_VARIABLE}.") from error
     _insist_private(path)
     return path
 
@@ -48,8 +52,7 @@ def runtime_directory() -> Path:
 def _default_directory() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", tempfile.gettempdir())) / "rig" / "runs"
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(base) / "rig" if base else Path(tempfile.gettempdir()) / f"rig-{os.getuid()}"
+    return Path("/tmp") / f"rig-{os.getuid()}"
 
 
 def _insist_private(path: Path) -> None:
@@ -71,7 +74,7 @@ def running() -> list[Address]:
 
 def find(name: str) -> Address | None:
     """Return the run of this name, or ``None`` while it is not there."""
-    return _read(runtime_directory() / f"{name}.json")
+    return _read(address_file(name))
 
 
 def _age(path: Path) -> float:
@@ -92,9 +95,22 @@ def _read(path: Path) -> Address | None:
         raise LinkError(f"link: {path} is damaged ({error}). Remedy: delete it.") from error
 
 
+def address_file(name: str) -> Path:
+    """Return where a run of this name says that it serves.
+
+    Raises
+    ------
+    LinkError
+        The name is no plain word, or the directory is not this user's own.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9-]{1,64}", name):
+        raise LinkError(f"link: {name!r} is no name for a run. Remedy: letters, digits and hyphens.")
+    return runtime_directory() / f"{name}.json"
+
+
 def publish(address: Address) -> Path:
     """Write the file of a run that serves from now on; whoever sees it sees all of it."""
-    path = runtime_directory() / f"{address.name}.json"
+    path = address_file(address.name)
     text = json.dumps({"host": address.host, "port": address.port, "key": address.key.hex(), "pid": address.pid})
     draft = path.with_suffix(".new")
     with open(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="utf-8") as file:
@@ -105,4 +121,4 @@ def publish(address: Address) -> Path:
 
 def forget(address: Address) -> None:
     """Remove the file of a run that died without doing so itself."""
-    (runtime_directory() / f"{address.name}.json").unlink(missing_ok=True)
+    address_file(address.name).unlink(missing_ok=True)

@@ -13,9 +13,10 @@ from multiprocessing.connection import Client, Connection, Listener
 from types import TracebackType
 from typing import Any, Self
 
-from rig.link_address import Address, LinkError, publish, runtime_directory
+from drivers.errors import DeviceError
+from rig.link_address import Address, LinkError, address_file, publish
 from rig.link_proof import admit, hang_up, receive_text
-from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, Watcher
+from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, Watcher
 from rig.wire import Gap, Message, encode, samples_of
 from sequences.frame import Frame
 
@@ -33,7 +34,7 @@ _MOST_CONNECTIONS = 64
 
 
 class _Log:
-    """What was sent, numbered; consoles read at their own pace. Samples are forgotten oldest first, the rest never."""
+    """What was sent, numbered; consoles read at their own pace. Samples and progress are forgotten oldest first."""
 
     def __init__(self, memory: int) -> None:
         self._memory = memory
@@ -107,7 +108,7 @@ class LinkServer(Watcher):
         self._behind: dict[str, bool] = {}
         self.dropped = 0
         """Frames dropped because the link's own thread did not keep up."""
-        runtime_directory()  # refuses before anything is open
+        address_file(self._name)  # refuses before anything is open
         self._listener = Listener(("127.0.0.1", 0), backlog=_MOST_CONNECTIONS)
         host, port = self._listener.address
         self.address = Address(self._name, host, port, secrets.token_bytes(32), os.getpid())
@@ -212,7 +213,7 @@ class LinkServer(Watcher):
             self._send_frames(frames)
             if isinstance(item, RunInfo):
                 self._log.restart()
-            self._log.append(encode(item), forgettable=False)
+            self._log.append(encode(item), forgettable=isinstance(item, StepEvent) and item.phase is StepPhase.PROGRESS)
         self._send_frames(frames)
 
     def _send_frames(self, frames: list[Frame]) -> None:
@@ -288,7 +289,10 @@ class LinkServer(Watcher):
 
     def _obey(self, command: str, who: str) -> dict[str, Any]:
         if command == "emergency stop":  # anybody who watches may stop the rig
-            self._controls.emergency_stop()
+            try:
+                self._controls.emergency_stop()
+            except DeviceError as error:  # the run ends all the same
+                return {"done": False, "text": str(error)}
             return {"done": True, "text": ""}
         actions = {
             "claim": lambda: None,

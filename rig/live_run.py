@@ -177,22 +177,28 @@ class Beside:
         self._feeder = threading.Thread(target=self._feed, daemon=True, name="live prediction feed")
         self._feeder.start()
         self.lost = False
-        """Whether the process has died or is hopelessly behind; the run goes on without predictions."""
+        """Whether the process has died or is hopelessly behind."""
 
     def step(self, event: StepEvent) -> None:
         """See ``Maker``."""
         self._put({"step": event.name, "sample": event.sample})
 
     def frame(self, glance: Glance) -> LivePrediction | None:
-        """See ``Maker``."""
+        """See ``Maker``.
+
+        Raises
+        ------
+        ChildProcessError
+            The process has died or is hopelessly behind; there will be no more predictions.
+        """
         self._put({"frame": glance})
         try:
-            if self.lost or not self._pipe.poll():
-                return None
-            return LivePrediction.from_json(self._pipe.recv_bytes().decode())
+            if not self.lost:
+                return LivePrediction.from_json(self._pipe.recv_bytes().decode()) if self._pipe.poll() else None
         except (EOFError, OSError):
             self.lost = True
-            return None
+        self.close()
+        raise ChildProcessError("the process of the live prediction has died or fallen behind; the run goes on without")
 
     def _put(self, message: object) -> None:
         if self._queue.qsize() > MOST_WAITING:

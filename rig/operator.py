@@ -10,6 +10,7 @@ from typing import TextIO
 
 from rig.errors import Refused
 from rig.observe import Controls, Event, Watcher
+from rig.voice import Voice
 
 
 class Keyboard:
@@ -23,6 +24,7 @@ class Keyboard:
         self._presses: queue.Queue[None] = queue.Queue()
         self._lock = threading.Lock()
         self._controls: Controls | None = None
+        self._alone = False
         self._thread: threading.Thread | None = None
         self._closed = False
 
@@ -45,12 +47,22 @@ class Keyboard:
                 return self._presses.get(timeout=0.2)
         raise Refused(f"{text} Nobody can answer: standard input is closed. Remedy: run it in a terminal")
 
-    def answer_for(self, controls: Controls) -> bool:
-        """Let the next Enter resume a run; return whether anyone can press it."""
+    def answer_for(self, controls: Controls, *, alone: bool = True) -> bool:
+        """Let the next Enter resume a run; return whether anyone can press it.
+
+        If nobody can, now or later, and the keyboard is ``alone`` in taking answers, the run is ended in good order.
+        """
         with self._lock:
-            self._controls = controls
+            self._controls, self._alone = controls, alone
         self._read()
+        self._give_up()
         return not self._closed
+
+    def _give_up(self) -> None:
+        """End a run that waits for an Enter which nobody can press any more."""
+        with self._lock:
+            if self._closed and self._alone and self._controls is not None:
+                self._controls.stop()
 
     def _read(self) -> None:
         if self._thread is None:
@@ -64,6 +76,7 @@ class Keyboard:
         except (OSError, ValueError) as error:  # the terminal is gone
             print(f"rig: the keyboard cannot be read any more ({error})", file=sys.stderr)
         self._closed = True
+        self._give_up()
 
     def _pressed(self) -> None:
         with self._lock:
@@ -75,16 +88,21 @@ class Keyboard:
 
 
 class Prompts(Watcher):
-    """Answers the prompts of one run from the keyboard; the console's button works as well."""
+    """Answers the prompts of one run from the keyboard; where consoles can attach, their button works as well."""
 
-    def __init__(self, keyboard: Keyboard, controls: Controls) -> None:
+    def __init__(self, keyboard: Keyboard, controls: Controls, voice: Voice, *, linked: bool = False) -> None:
         self._keyboard = keyboard
         self._controls = controls
+        self._voice = voice
+        self._linked = linked
 
     def event(self, event: Event) -> None:
         """Say how to answer a prompt, and wait for the answer elsewhere."""
         if event.kind != "prompt":
             return
-        can_answer = self._keyboard.answer_for(self._controls)
-        words = "press Enter, or resume in the console" if can_answer else "resume in the console"
-        print(f"            {words}", file=sys.stderr, flush=True)
+        can_answer = self._keyboard.answer_for(self._controls, alone=not self._linked)
+        ways = ["press Enter"] * can_answer + ["resume in the console"] * self._linked
+        nobody = (
+            "nobody can answer, standard input is closed: the run ends. Remedy: run it in a terminal, or with --link"
+        )
+        self._voice.say(f"            {', or '.join(ways) or nobody}\n")

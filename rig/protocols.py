@@ -18,8 +18,13 @@ from sequences.pull_off import PullOff, PullOffSettings
 from sequences.step import Apparatus, Step, by_hand
 
 
-def build_steps(scene: Scene, apparatus: Apparatus) -> list[Step]:
-    """Return the steps of the scene's protocol."""
+def build_steps(scene: Scene, apparatus: Apparatus, hands: str = "") -> list[Step]:
+    """Return the steps of the scene's protocol; ``hands`` is what the operator is asked to do before the first."""
+    steps = _protocol_steps(scene, apparatus)
+    return [by_hand(apparatus, "place", "the operator goes on", hands), *steps] if hands else steps
+
+
+def _protocol_steps(scene: Scene, apparatus: Apparatus) -> list[Step]:
     protocol = scene.protocol
     if isinstance(protocol, VolumeSection):
         strokes = [stroke * 1e-6 for stroke in protocol.strokes_ml]

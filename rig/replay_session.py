@@ -74,7 +74,7 @@ def replay(
     reporter.store = verification
     bench = recording.bench
     apparatus = Apparatus(instruments.stage, instruments.pump, reporter, bench.limits.look_ahead_um * 1e-6)
-    steps = build_steps(recording.scene, apparatus)
+    steps = build_steps(recording.scene, apparatus, recording.configuration.get("hands", ""))
     if live and (what_if is not None or len(recording.predictions)):
         reporter.add(_live(recording, reporter, what_if))
     loop = Loop(

@@ -61,6 +61,8 @@ class Request:
         Who is told of everything, and how the operator speaks to the run.
     place
         Position on the membrane, or sample, where a protocol names several.
+    hands
+        What the operator is asked to do before the first step, while the instruments are open.
     repeat, repeats
         Which of how many tests of this scene in a row, from 1.
     seed, speed, wire, faults, referenced
@@ -84,6 +86,7 @@ class Request:
     repeat: int = 1
     repeats: int = 1
     place: str = ""
+    hands: str = ""
 
 
 def run_scene(request: Request) -> Ending:
@@ -134,7 +137,7 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     stage = CommandedStage(opened.stage, lambda text: reporter.event("command", text))
     pump = None if opened.pump is None else CommandedPump(opened.pump, lambda text: reporter.event("command", text))
     apparatus = Apparatus(stage, pump, reporter, request.bench.limits.look_ahead_um * 1e-6)
-    steps = build_steps(request.scene, apparatus)
+    steps = build_steps(request.scene, apparatus, request.hands)
     info = _info(request, opened, steps)
     journalled = request.bench.recording.survives_power_cut
     daq = opened.daq
@@ -290,6 +293,7 @@ def _metadata(request: Request) -> dict[str, str]:
         "bench": request.bench_text,
         "seed": str(request.seed),
         "place": request.place,
+        "hands": request.hands,
         "versions": json.dumps(
             {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}, sort_keys=True
         ),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from typing import TextIO
-
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase, Watcher
+from rig.voice import Voice
 
 _SCALES = {"N": ("N", 1.0), "Pa": ("kPa", 1e-3), "s": ("s", 1.0), "m": ("mm", 1e3)}
 _SHOWN = {"warning", "fault", "interlock", "operator", "prompt"}
@@ -14,9 +12,9 @@ _SHOWN = {"warning", "fault", "interlock", "operator", "prompt"}
 class Terminal(Watcher):
     """Writes to standard error; on a terminal the running step's line is rewritten in place."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = sys.stderr if stream is None else stream
-        self._live = self._stream.isatty()
+    def __init__(self, voice: Voice | None = None) -> None:
+        self._voice = Voice() if voice is None else voice
+        self._live = self._voice.live
         self._conditions: dict[str, str] = {}
         self._rate = 1.0
 
@@ -46,8 +44,8 @@ class Terminal(Watcher):
     def finished(self, ending: Ending) -> None:
         """Say how it ended."""
         self._line(f"{ending.samples / self._rate:8.1f} s  ended: {ending.reason}")
+        self._voice.finish()
 
     def _line(self, text: str, *, stay: bool = False) -> None:
         lead, end = ("\r\x1b[K", "") if self._live else ("", "\n")
-        self._stream.write(f"{lead}{text}{end if stay or not self._live else chr(10)}")
-        self._stream.flush()
+        self._voice.say(f"{lead}{text}{end if stay or not self._live else chr(10)}")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from conftest import scene_text
 
-from rig.campaign import JOURNAL, Journal, load_campaign
+from rig.campaign import JOURNAL, Journal, load_campaign, single
 from rig.cli import main
 from rig.errors import FileError
 from rig.recording import load_recording
@@ -220,6 +220,35 @@ def test_the_pressure_of_a_test_is_in_its_scene_whatever_the_scene_looks_like(tm
     )
     _, tests = load_campaign(tmp_path / "c.toml")
     assert [test.scene.protocol.initial_pressure_kPa for test in tests] == [-1.5, 0.5]
-    assert [test.key for test in tests] == ["01-glass_-1.5kPa", "01-glass_+0.5kPa"]
+    assert [test.key for test in tests] == ["01-glass_-1.5kPa-1", "01-glass_+0.5kPa-1"]
     assert [test.scene.title for test in tests] == ["glass at -1.5 kPa", "glass at +0.5 kPa"]
     assert all(parse_scene(test.scene_text, "again") == test.scene and "# glass" in test.scene_text for test in tests)
+
+
+def test_more_repeats_measure_nothing_twice(tmp_path):
+    (tmp_path / "zero.toml").write_text(scene_text("pressure-zero", rest_s=0.5), "utf-8")
+    path, folder = tmp_path / "c.toml", tmp_path / "out"
+    for repeats in (1, 3, 2):
+        path.write_text(f'title = "c"\n[[test]]\nscene = "zero.toml"\nrepeats = {repeats}\n', "utf-8")
+        assert run(path, folder) == 0
+    assert [entry["key"] for entry in journal(folder)] == ["01-zero-1", "01-zero-2", "01-zero-3"]
+
+
+def test_places_whose_recordings_would_have_one_name_are_refused(tmp_path):
+    scene = scene_text("indentation", positions=["a!", "b", "a?"])
+    (tmp_path / "s.toml").write_text(scene, "utf-8")
+    (tmp_path / "c.toml").write_text('title = "c"\n[[test]]\nscene = "s.toml"\n', "utf-8")
+    with pytest.raises(FileError, match=r"'a!' and 'a\?' would both be recorded as 01-s-a_-1\. Remedy"):
+        load_campaign(tmp_path / "c.toml")
+    with pytest.raises(FileError, match="would both be recorded"):
+        single(parse_scene(scene, "s"), scene, "s", 1, 0)
+
+
+@pytest.mark.parametrize("name", ["../other.h5", "/etc/passwd", "folder/one.h5", ""])
+def test_a_journal_names_files_of_its_folder_only(tmp_path, campaign, name):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    lines = [json.dumps({"key": "01-zero-1", "recording": name}), json.dumps({"key": "x", "recording": "x.h5"})]
+    (folder / JOURNAL).write_text("\n".join(lines) + "\n", "utf-8")
+    with pytest.raises(FileError, match="line 1: no entry"):
+        Journal(folder).done()

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.errors import NotConnected
 from drivers.interfaces import PumpState, PumpStatus, StageStatus
 from rig import link_address as addresses
 from rig import link_server, wire
@@ -250,6 +251,28 @@ def test_a_damaged_address_file_is_named(runtime: Path) -> None:
     path.chmod(0o600)
     with pytest.raises(LinkError, match=r"run-1\.json is damaged"):
         addresses.running()
+
+
+def test_a_run_has_a_plain_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(link_server.NAME_VARIABLE, "../elsewhere")
+    with pytest.raises(LinkError, match="no name for a run"):
+        LinkServer(Controls())
+
+
+def test_an_emergency_stop_that_does_not_reach_the_stage_is_told_to_the_console() -> None:
+    def unplugged() -> None:
+        raise NotConnected("stage", "the stop could not be sent", "check the cable")
+
+    controls = Controls()
+    controls.connect(unplugged)
+    with LinkServer(controls) as server:
+        link = Link(server.address)
+        answer = link.emergency_stop()
+        assert not answer.done
+        assert "the stop could not be sent" in answer.text
+        assert not link.killed
+        assert controls.take() is Wish.EMERGENCY
+        link.close()
 
 
 def test_memory_for_a_console_that_lags_is_bounded_and_the_loss_is_told() -> None:

@@ -16,6 +16,7 @@ from rig.operator import Keyboard, Prompts
 from rig.recording import load_recording
 from rig.scene import parse_scene
 from rig.session import Request, run_scene
+from rig.voice import Voice
 
 PROMPT = Event(0, "prompt", "Hang 20 g on the gripper, then go on")
 
@@ -38,7 +39,7 @@ def taken(controls):
 def test_enter_resumes_the_run_that_asked(line):
     keyboard, press = line
     controls = Controls()
-    Prompts(keyboard, controls).event(PROMPT)
+    Prompts(keyboard, controls, Voice()).event(PROMPT)
     press.write("\n")
     assert taken(controls) is Wish.RESUME
     press.close()
@@ -47,7 +48,7 @@ def test_enter_resumes_the_run_that_asked(line):
 def test_only_a_prompt_is_answered(line):
     keyboard, press = line
     controls = Controls()
-    Prompts(keyboard, controls).event(Event(0, "warning", "the load is high"))
+    Prompts(keyboard, controls, Voice()).event(Event(0, "warning", "the load is high"))
     press.write("\n")
     press.close()
     assert controls.take() is Wish.NONE
@@ -87,8 +88,22 @@ def test_a_closed_keyboard_refuses_and_names_the_console(capsys):
     keyboard = Keyboard(io.StringIO(""))
     with pytest.raises(Refused, match="Nobody can answer"):
         keyboard.confirm("Mount the sphere.")
-    Prompts(keyboard, Controls()).event(PROMPT)
-    assert "resume in the console" in capsys.readouterr().err.splitlines()[-1]
+    for linked in (False, True):
+        controls, voice = Controls(), Voice()
+        Prompts(keyboard, controls, voice, linked=linked).event(PROMPT)
+        voice.finish()
+        words = "resume in the console" if linked else "nobody can answer"
+        assert words in capsys.readouterr().err.splitlines()[-1]
+        assert controls.take() is (Wish.NONE if linked else Wish.STOP)
+
+
+def test_a_question_ends_the_run_when_the_keyboard_is_closed_while_it_waits(line):
+    keyboard, press = line
+    controls = Controls()
+    assert keyboard.answer_for(controls)
+    assert controls.take() is Wish.NONE
+    press.close()
+    assert taken(controls) is Wish.STOP
 
 
 def test_a_run_waits_at_a_prompt_and_keeps_recording(tmp_path, line, monkeypatch):
@@ -112,7 +127,7 @@ def test_a_run_waits_at_a_prompt_and_keeps_recording(tmp_path, line, monkeypatch
     monkeypatch.setattr("rig.emulation.Hands.event", Watcher.event)
     bench, bench_text = load_bench(None)
     text = scene_text("pressure-zero", rest_s=0.5)
-    observers = [Prompts(keyboard, controls), Operator()]
+    observers = [Prompts(keyboard, controls, Voice()), Operator()]
     out = tmp_path / "run.h5"
     request = Request(
         parse_scene(text, "scene"), text, bench, bench_text, out,

@@ -199,6 +199,16 @@ def test_a_limit_of_time_stops_the_stage_and_is_told_as_an_interlock(request_for
     assert [row["kind"] for row in recording.events if b"late" in row["text"]] == [b"interlock", b"end"]
 
 
+def test_a_run_that_needs_hands_asks_first_and_replays(request_for):
+    request = request_for(hands="Bring the probe over center")
+    assert run_scene(request).exit_code == 0
+    recording = load_recording(request.out)
+    assert [step.name for step in recording.step_table()][:3] == ["place", "tare", "approach"]
+    asked = [row["text"].decode() for row in recording.events if row["kind"] == b"prompt"]
+    assert asked[0] == "Bring the probe over center, then go on"
+    assert replay(recording, pace=Pace()).differences == ()
+
+
 def test_an_observer_that_fails_harms_nothing(request_for):
     class Broken(Watcher):
         def frame(self, frame):

@@ -128,8 +128,10 @@ def _observers(request: Request, keyboard: Keyboard | None) -> list[Observer]:
         return []
     from rig.operator import Prompts
     from rig.terminal import Terminal
+    from rig.voice import Voice
 
-    return [Terminal(), Prompts(keyboard, request.controls)]
+    voice = Voice()
+    return [Terminal(voice), Prompts(keyboard, request.controls, voice)]
 
 
 def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reason: str) -> int:

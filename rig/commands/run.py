@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed", default="max", help="emulated bench: times real time, or max (default)")
     parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
     parser.add_argument("--faults", type=Path, help="emulated bench: fault script")
-    parser.add_argument("--repeat", type=int, default=1, help="how many tests in a row")
+    parser.add_argument("--repeat", type=int, default=1, help="how many tests in a row, up to 1000")
     parser.add_argument("--console", action="store_true", help="watch and command the run in the console's window")
     parser.add_argument("--link", action="store_true", help="let consoles attach")
     parser.add_argument("--no-live", action="store_true", help="no live prediction")
@@ -45,7 +45,10 @@ def run(arguments: argparse.Namespace) -> int:
     keyboard, place = Keyboard(), ""
     for test, request in _requests(arguments):
         if test.place != place and not request.bench.is_emulated:
-            keyboard.confirm(test.prompt)
+            if arguments.link:  # a console cannot attach before the run
+                request.hands = test.prompt.rstrip(".")
+            else:
+                keyboard.confirm(test.prompt)
         place = test.place
         ending = _run_once(request, arguments, keyboard)
         if ending.exit_code:
@@ -56,11 +59,13 @@ def run(arguments: argparse.Namespace) -> int:
 def _requests(arguments: argparse.Namespace) -> Iterator[tuple[PlannedTest, Request]]:
     """Yield the tests of the scene: its places, each so often."""
     from rig.bench import load_bench
-    from rig.campaign import single
+    from rig.campaign import MOST_REPEATS, single
     from rig.errors import FileError
     from rig.library import load_scene
     from rig.session import Request
 
+    if not 1 <= arguments.repeat <= MOST_REPEATS:
+        raise FileError(f"--repeat {arguments.repeat}: not from 1 to {MOST_REPEATS}. Remedy: a campaign takes more.")
     scene, text = load_scene(arguments.scene)
     bench, bench_text = load_bench(arguments.bench)
     if not bench.is_emulated and arguments.speed != "max":
@@ -123,10 +128,12 @@ def _run_once(request: Request, arguments: argparse.Namespace, keyboard: Keyboar
     from rig.operator import Prompts
     from rig.session import run_scene
     from rig.terminal import Terminal
+    from rig.voice import Voice
 
-    observers: list[Observer] = [Terminal()]
+    voice = Voice()
+    observers: list[Observer] = [Terminal(voice)]
     if not request.bench.is_emulated:
-        observers.append(Prompts(keyboard, request.controls))
+        observers.append(Prompts(keyboard, request.controls, voice, linked=arguments.link))
     request.observers = observers
     with ExitStack() as links:
         if arguments.link:
