@@ -27,7 +27,7 @@ from rig.console.panels import step_words
 from rig.console.runner import Child, replay_arguments, run_arguments
 from rig.console.theme import THEMES
 from rig.console.window import Console
-from rig.library import shipped
+from rig.library import find, shipped
 from rig.link_address import DIRECTORY_VARIABLE
 from rig.link_server import LinkServer
 from rig.observe import Controls, Event, Wish
@@ -253,6 +253,17 @@ def test_two_watch_and_one_commands(console: Console, qtbot: QtBot, publish: Cal
 
 def table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def test_a_title_is_shown_to_the_letter(console: Console, tmp_path: Path) -> None:
+    text, _ = find("scene", "sphere-60mm-low")
+    scene = tmp_path / "odd.toml"
+    scene.write_text(text.replace("60 mm glass sphere", "<h1>60 mm</h1>"), "utf-8")
+    console.controls.scene.addItem(str(scene))
+    console.controls.scene.setCurrentText(str(scene))
+    console.check()
+    assert console.title.text().startswith("<h1>60 mm</h1>")
+    assert console.title.textFormat() is Qt.TextFormat.PlainText
 
 
 def test_exports_hold_what_is_shown(

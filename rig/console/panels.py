@@ -17,11 +17,16 @@ from rig.console.words import condition, fraction, number
 from rig.live_prediction import Estimate, LivePrediction
 from rig.observe import RunInfo
 
+_FROM_FILES = ("title", "banner", "step")
+"""Labels that show what a scene or an instrument says, to the letter."""
+
 
 def label(name: str, text: str = "") -> QLabel:
     """Return a label that the style sheet knows by name."""
     widget = QLabel(text)
     widget.setObjectName(name)
+    if name in _FROM_FILES:
+        widget.setTextFormat(Qt.TextFormat.PlainText)
     return widget
 
 
