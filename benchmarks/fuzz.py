@@ -15,7 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-PARTS = ["rig", "drivers", "tomllib", "pipython", "nidaqmx", "fuzz_targets"]
+PARTS = ["rig", "drivers", "tomllib", "pipython", "nidaqmx", "tomlkit", "fuzz_targets"]
 
 
 def serve(name: str, words: list[str]) -> None:

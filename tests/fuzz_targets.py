@@ -34,6 +34,7 @@ from drivers.errors import DeviceError
 from drivers.pump import LegatoPump, parse_quantity, parse_reply
 from drivers.stage import PIStage
 from rig.bench import load_bench, parse_bench
+from rig.campaign import JOURNAL, Journal, load_campaign
 from rig.check import check
 from rig.errors import FileError, Refused
 from rig.fault_script import load_faults
@@ -49,6 +50,11 @@ from rig.session import Request, run_scene
 SCENE = scene_text("sphere-60mm-low")
 BENCH = load_bench(None)[1]
 FAULTS = '[[fault]]\ndevice = "pump"\nkind = "stalled"\nat_step = "pressurize"\nvalue = 1.0\n'
+CAMPAIGN = (
+    'title = "t"\norder = "random"\nseed = 1\nrepeats = 2\n[[test]]\nscene = "flat-low"\nname = "glass"\n'
+    'initial_pressures_kPa = [1.6, -2.9]\nprompt = "Mount it."\n'
+)
+JOURNAL_LINE = '{"key": "01-glass-1", "recording": "01-glass-1.h5", "scene": "0123"}\n'
 NAMES = ("force", "pressure", "supply")
 
 
@@ -110,6 +116,24 @@ def fault_file(data: bytes) -> None:
     path.write_bytes(data)
     try:
         load_faults(path)
+    except FileError as error:
+        one_message(error)
+
+
+def campaign_file(data: bytes) -> None:
+    path = _scratch() / "campaign.toml"
+    path.write_bytes(data)
+    try:
+        load_campaign(path)
+    except FileError as error:
+        one_message(error)
+
+
+def campaign_journal(data: bytes) -> None:
+    (_scratch() / JOURNAL).write_bytes(data)
+    journal = Journal(_scratch())
+    try:
+        assert all(Path(name).name == name for name in journal.done().values())
     except FileError as error:
         one_message(error)
 
@@ -383,6 +407,8 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], tuple[bytes, ...]]] = {
     "scene files": (scene_file, (SCENE.encode(),)),
     "bench files": (bench_file, (BENCH.encode(),)),
     "fault scripts": (fault_file, (FAULTS.encode(),)),
+    "campaign files": (campaign_file, (CAMPAIGN.encode(),)),
+    "campaign journals": (campaign_journal, (JOURNAL_LINE.encode() * 2, JOURNAL_LINE.encode() + b"{")),
     "GCS replies": (gcs_replies, (bytes(18), b"\0\0" * 9 + b"\4\0" + b"1=5\n")),
     "Legato replies": (legato_replies, (b"\n1 2 3 I...i.\r\n>\x11", b"6.5 ml/min")),
     "gRPC replies": (grpc_replies, (bytes(40), b"\2\0" * 20)),
