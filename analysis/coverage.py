@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SENSORS = Sensors(
     force_gain=2e-3,
     force_linearity=3e-4,
+    force_capacity=5.0,
     pressure_gain=2.5e-3,
     pressure_offset=30.0,
     position=1e-4,
@@ -46,6 +47,7 @@ def _imperfections(generator: np.random.Generator) -> Imperfections:
         drift=4e-6 * normal(),
         wander=3e-4,
         bow=(SENSORS.force_linearity * normal(), SENSORS.force_linearity * normal()),
+        bow_load=SENSORS.force_capacity * 0.01 * 2 ** float(generator.uniform(-1, 1)),
         force_gain=SENSORS.force_gain * normal(),
         pressure_gain=SENSORS.pressure_gain * normal(),
         pressure_offset=SENSORS.pressure_offset * normal(),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from analysis.quantity import Quantity
 from model import jkr
+from model.parameters import Parameters
 
 EQUILIBRIUM_SEPARATION = 0.3e-9
 """z_0 of the Tabor parameter for van der Waals contacts, m."""
@@ -34,6 +35,11 @@ def _without_gain(force: Quantity) -> Quantity:
     parts = {source: part for source, part in force.budget.items() if source != "force calibration"}
     total = math.sqrt(sum(part**2 for part in parts.values())) if parts else force.uncertainty
     return Quantity(force.value, total, force.unit, force.explanation, parts)
+
+
+def full_contact_radius(parameters: Parameters) -> float:
+    """Return r_e, or the radius of a flat disk that is smaller, m."""
+    return min(parameters.gripper.effective_radius, (parameters.substrate.diameter or math.inf) / 2)
 
 
 def full_contact_area(radius: float, uncertainty: float = 0.0) -> Quantity:

@@ -48,12 +48,13 @@ class Extraction:
     """One pass over one run. Steps set the attributes; those that follow read them.
 
     Sample indices (``zero``, ``release``, ``peak``) and separations are ``nan`` until they are found.
-    ``creep`` may be given by an earlier pass; ``looks_for_creep`` is false then.
+    ``earlier`` is the pass over the run of which this is a changed copy: its creep stays, its fits are where others
+    begin.
     """
 
     run: Run
     creep: Creep | None = None
-    looks_for_creep: bool = True
+    earlier: Extraction | None = None
     values: dict[str, float] = field(default_factory=dict)
     details: dict[str, Details] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
@@ -137,7 +138,6 @@ class ExtractionStep:
     after: tuple[str, ...]
     uses: tuple[str, ...]
     protocols: tuple[str, ...]
-    once: bool
     function: Callable[[Extraction], Details]
 
     @property
@@ -161,7 +161,6 @@ def extraction_step(
     after: Iterable[str] = (),
     uses: Iterable[str] = (),
     protocols: Iterable[str] = (),
-    once: bool = False,
 ) -> Callable[[Callable[[Extraction], Details]], Callable[[Extraction], Details]]:
     """Register a step.
 
@@ -177,13 +176,11 @@ def extraction_step(
         Steps that come first but may have failed.
     protocols
         Protocols the step belongs to; all where empty.
-    once
-        Whether the step is too slow to repeat for uncertainties, and states its own in ``Extraction.stated``.
     """
 
     def register(function: Callable[[Extraction], Details]) -> Callable[[Extraction], Details]:
         order = (tuple(after), tuple(uses), tuple(protocols))
-        STEPS[name] = ExtractionStep(name, title, dict(gives or {}), *order, once, function)
+        STEPS[name] = ExtractionStep(name, title, dict(gives or {}), *order, function)
         return function
 
     return register
@@ -247,12 +244,11 @@ def _place_in_source(step: ExtractionStep) -> tuple[int, str, int]:
 def extract(run: Run, *, before: Extraction | None = None) -> Extraction:
     """Run every step that applies; a step that finds nothing leaves its features missing, with the reason.
 
-    A run that differs a little from one extracted ``before`` keeps its creep, and leaves out the steps done once only.
+    A run that differs a little from one extracted ``before`` keeps its creep, and its fits begin at those of that one.
     """
-    again = before is not None
-    work = Extraction(run) if before is None else Extraction(run, before.creep, looks_for_creep=False)
+    work = Extraction(run, None if before is None else before.creep, before)
     for step in ordered():
-        if (step.protocols and run.protocol not in step.protocols) or (again and step.once):
+        if step.protocols and run.protocol not in step.protocols:
             continue
         reason = next((f"needs {name}: {work.failed[name]}" for name in step.after if name in work.failed), None)
         if reason is None:

@@ -18,6 +18,12 @@ from model import jkr
 POINTS = 300
 """The retraction curve is averaged into so many points before a fit."""
 
+FEWEST = 12
+"""Points that a fit needs."""
+
+FITTED = {"fitted_work_of_adhesion_J_m2": "work_of_adhesion", "fitted_modulus_Pa": "modulus"}
+"""Features of the better fit, and which of its attributes each is."""
+
 WIDEST = 7.0
 """Work of adhesion, modulus and strength are sought within this logarithm of the first guess."""
 
@@ -59,16 +65,11 @@ def work_of_adhesion(work: Extraction) -> Details:
         return {"decision": "S13; without the membrane's modulus and thickness its validity is unknown"}
     membrane = work.run.parameters.membrane
     modulus = jkr.contact_modulus(membrane.youngs_modulus)
-    area = _area(work.run)
+    area = projected_area(work.run)
     contact = None if area is None else math.sqrt(area / math.pi)
     found = validity(force, radius, modulus, membrane.thickness, contact)
     decision = "S13 holds" if found.holds else "S13 with reserve: " + "; ".join(found.remarks)
     return {"decision": decision, "validity": found}
-
-
-def _area(run: Run) -> float | None:
-    area = run.settings.get("contact_area_mm2")
-    return float(area) * 1e-6 if isinstance(area, int | float) else None
 
 
 @extraction_step(
@@ -82,12 +83,46 @@ def _area(run: Run) -> float | None:
     },
 )
 def contact_area(work: Extraction) -> Details:
-    """Take the area measured on the still image (``contact_area_mm2`` of the scene) and divide the force by it."""
-    area = _area(work.run)
+    """Take the area measured on the still image of this recording and divide the force by it.
+
+    It comes from ``rig analyze --areas`` or from the scene (``contact_area_mm2``, ``projected_area_um2`` of fibres),
+    with its uncertainty; where none is stated, five per cent of the area.
+    """
+    area = projected_area(work.run)
     if area is None:
-        raise FeatureMissing("no contact_area_mm2: no still image was measured for this run")
+        raise FeatureMissing("no contact area: no still image was measured for this run (rig analyze --areas)")
     work.set(projected_area_m2=area, contact_stress_Pa=work.values["pull_off_force_N"] / area)
     return {"decision": f"A_pc = {area * 1e6:.3g} mm²"}
+
+
+@extraction_step(
+    "real contact area",
+    title="Real contact area",
+    after=("pull-off",),
+    protocols=("fiber",),
+    gives={
+        "real_area_m2": "real contact area of the fibres",
+        "real_contact_stress_Pa": "F_off over the real contact area",
+    },
+)
+def real_contact_area(work: Extraction) -> Details:
+    """Take the area of the fibres' tips seen by the confocal microscope (``real_area_um2``); divide the force by it."""
+    area = area_of(work.run, "real_area_um2")
+    if area is None:
+        raise FeatureMissing("no real_area_um2 was measured for this run (rig analyze --areas)")
+    work.set(real_area_m2=area, real_contact_stress_Pa=work.values["pull_off_force_N"] / area)
+    return {"decision": f"A_rc = {area * 1e12:.5g} µm²"}
+
+
+def projected_area(run: Run) -> float | None:
+    """Return the projected area measured for a run, m^2, or ``None``."""
+    return area_of(run, "projected_area_um2" if run.protocol == "fiber" else "contact_area_mm2")
+
+
+def area_of(run: Run, key: str) -> float | None:
+    """Return an area of the run's settings, m^2, or ``None``."""
+    area = run.settings.get(key)
+    return float(area) * (1e-6 if key.endswith("_mm2") else 1e-12) if isinstance(area, int | float) else None
 
 
 @dataclass(frozen=True)
@@ -155,7 +190,7 @@ def fit_contact(
     """
     length = max(1, separation.size // POINTS)
     place, pull = block_means(separation, length), block_means(force, length)
-    if place.size < 12 or pull.min() >= 0:
+    if place.size < FEWEST or pull.min() >= 0:
         raise FeatureMissing("the retraction holds no tension to fit")
     work, modulus, origin = _first_guess(place, pull, radius)
     first = _cornered("JKR", place, pull, radius, [math.log(work), math.log(modulus)], origin)
@@ -239,7 +274,7 @@ def _solve(
         corner, origin = (float(value) * 1e-6 for value in unknown[-2:])
         return (_force(model, origin - place, origin - corner, unknown[:-2], radius) - pull) / scale
 
-    start = np.array([*logs, min(corner, last) / 1e-6, origin / 1e-6])
+    start = np.array([*logs, min(max(corner, first), last) / 1e-6, origin / 1e-6])
     lowest = np.array([*(log - WIDEST for log in logs), first / 1e-6 - 1e-3, -np.inf])
     highest = np.array([*(log + WIDEST for log in logs), last / 1e-6 + 1e-3, np.inf])
     solution = least_squares(residual, start, bounds=(lowest, highest), max_nfev=200, x_scale="jac")
@@ -275,7 +310,6 @@ def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float
     title="JKR and DMT beside S13",
     after=("work of adhesion", "detachment"),
     protocols=("indentation",),
-    once=True,
     gives={
         "fitted_work_of_adhesion_J_m2": "work of adhesion of the contact model that fits the retraction best",
         "fitted_modulus_Pa": "contact modulus E* of that model",
@@ -285,8 +319,9 @@ def contact_models(work: Extraction) -> Details:
     """Fit JKR and DMT to the attached part of the retraction, F against z, and keep the better.
 
     At first the contact line is pinned (hysteresis), and the contact as stiff as a punch; where it begins to recede is
-    fitted too. The uncertainty holds how far the same model moves when it is fitted to the tension alone, or with a
-    compliance one standard uncertainty larger, and the spread between the models, the less the worse the other fits.
+    fitted too. The fit is repeated on the perturbed copies of the run. Added to the uncertainty is how far the same
+    model moves when it is fitted to the tension alone, and the spread between the models, the less the worse the other
+    fits.
 
     Maugis has one parameter more and is fitted on request only (``fit_contact``): it follows noise where the others
     suffice.
@@ -294,21 +329,35 @@ def contact_models(work: Extraction) -> Details:
     start, _ = work.retraction()
     part, tense = slice(start, int(work.release)), slice(max(start, int(work.zero)), int(work.release))
     radius = indenter_radius(work.run)
+    if work.earlier is not None:
+        return _fitted_again(work, work.earlier, part, radius)
     best, rival = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
-    stretched = work.separation[part] + work.run.sensors.compliance_uncertainty * work.force[part]
-    others = [
-        fit_contact(separation, force, radius, models=(best.model,))[0]
-        for separation, force in ((work.separation[tense], work.force[tense]), (stretched, work.force[part]))
-    ]
+    narrow = fit_contact(work.separation[tense], work.force[tense], radius, models=(best.model,))[0]
     plausible = best.misfit / rival.misfit / 12**0.5
-    for name, key in (("fitted_work_of_adhesion_J_m2", "work_of_adhesion"), ("fitted_modulus_Pa", "modulus")):
-        value = float(getattr(best, key))
-        spread = [value - float(getattr(other, key)) for other in others]
-        spread += [plausible * (value - float(getattr(rival, key))), work.run.sensors.force_gain * value]
+    for name, key in FITTED.items():
+        value, other, third = (float(getattr(fit, key)) for fit in (best, narrow, rival))
         work.set(**{name: value})
-        work.stated[name] = math.hypot(float(getattr(best, f"{key}_uncertainty")), *spread)
+        own = float(getattr(best, f"{key}_uncertainty"))
+        work.stated[name] = math.hypot(own, value - other, plausible * (value - third))
     words = "; ".join(
         f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in (best, rival)
     )
     pinned = (best.corner - float(best.separation[0])) * 1e6
     return {"decision": f"{words}; the line recedes after {max(pinned, 0.0):.0f} um", "fits": (best, rival)}
+
+
+def _fitted_again(work: Extraction, earlier: Extraction, part: slice, radius: float) -> Details:
+    """Fit a changed copy of a run, from the fit of the run itself."""
+    if "contact models" not in earlier.details:
+        raise FeatureMissing(earlier.failed["contact models"])
+    fits = earlier.details["contact models"]["fits"]
+    assert isinstance(fits, tuple)
+    length = max(1, (part.stop - part.start) // POINTS)
+    place, pull = block_means(work.separation[part], length), block_means(work.force[part], length)
+    if place.size < FEWEST:
+        raise FeatureMissing("the retraction holds too little to fit")
+    best = fits[0]
+    logs = [math.log(best.work_of_adhesion), math.log(best.modulus)]
+    fit = _solve(best.model, place, pull, radius, logs, best.corner, best.origin)
+    work.set(**{name: float(getattr(fit, key)) for name, key in FITTED.items()})
+    return {"decision": "as before", "fits": (fit,)}

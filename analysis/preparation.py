@@ -136,7 +136,7 @@ def _without_creep(work: Extraction, level: float, margin: int) -> Array:
     if sensors.creep_time > 0:
         calibrated = (sensors.creep, sensors.creep_uncertainty, sensors.creep_time)
         work.creep = known_creep(run.force - level, run.rate, *calibrated)
-    elif work.looks_for_creep and work.windows.dwell is not None and after is not None:
+    elif work.earlier is None and work.windows.dwell is not None and after is not None:
         work.creep = find_creep(run.force - level, run.rate, work.windows.dwell, after)
     creep = work.creep
     if creep is None or not creep.share:

@@ -89,6 +89,8 @@ class Pooled:
         How many.
     uncertainty
         Standard uncertainty of the mean: deviation / sqrt(n), and the sources common to all repeats.
+    budget
+        The same by source; what differs from repeat to repeat under ``"repeats"``.
     """
 
     mean: float
@@ -96,6 +98,7 @@ class Pooled:
     count: int
     uncertainty: float
     unit: str
+    budget: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -125,15 +128,24 @@ class Group:
 def pool(quantities: Sequence[Quantity]) -> Pooled:
     """Pool one quantity over repeats."""
     values = np.array([quantity.value for quantity in quantities])
-    common = np.array([_common(quantity) for quantity in quantities])
     deviation = float(values.std(ddof=1)) if values.size > 1 else float("nan")
-    random = deviation / np.sqrt(values.size) if values.size > 1 else quantities[0].uncertainty
-    total = random if values.size == 1 else float(np.hypot(random, float(common.mean())))
-    return Pooled(float(values.mean()), deviation, values.size, float(total), quantities[0].unit)
+    random = deviation / np.sqrt(values.size) if values.size > 1 else _random(quantities[0])
+    sources = dict.fromkeys(source for quantity in quantities for source in quantity.budget)
+    common = {
+        source: float(np.mean([quantity.budget.get(source, 0.0) for quantity in quantities]))
+        for source in sources
+        if source not in RANDOM_SOURCES
+    }
+    total = float(np.sqrt(random**2 + sum(part**2 for part in common.values())))
+    unit = quantities[0].unit
+    return Pooled(float(values.mean()), deviation, values.size, total, unit, {"repeats": float(random), **common})
 
 
-def _common(quantity: Quantity) -> float:
-    return float(np.sqrt(sum(part**2 for source, part in quantity.budget.items() if source not in RANDOM_SOURCES)))
+def _random(quantity: Quantity) -> float:
+    """What of a number's uncertainty is not common to all repeats."""
+    if not quantity.budget:
+        return quantity.uncertainty
+    return float(np.sqrt(sum(part**2 for source, part in quantity.budget.items() if source in RANDOM_SOURCES)))
 
 
 def group(analyses: Iterable[Analysis]) -> list[Group]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from analysis.derived import full_contact_area, full_contact_radius
 from analysis.errors import FeatureMissing
 from analysis.extraction import CONTACT_TESTS, SMOOTHING, Details, Extraction, extraction_step
 from analysis.numerics import RECTANGULAR, Array, ForceJump, LocalFit, find_jumps, fit_around, fit_window, running_mean
@@ -364,14 +365,14 @@ def gas_work(work: Extraction) -> Details:
 def stress(work: Extraction) -> Details:
     """Divide F_p by the contact area, known only where the contact is full: flats and large spheres.
 
-    The papers use r_e = 7.3 mm there (1.67 cm^2); on smaller spheres the area could not be seen.
+    The papers use r_e = 7.3 mm there (1.67 cm^2), an average estimate; on smaller spheres the area could not be seen.
+    Its uncertainty is that of r_e (``effective_radius_uncertainty_mm``, 0.1 mm unless the scene says otherwise).
     """
     parameters = work.run.parameters
     if parameters is None:
         raise FeatureMissing("without parameters the contact area is unknown")
-    gripper = parameters.gripper
-    if parameters.substrate.radius < 3 * gripper.radius:
+    if parameters.substrate.radius < 3 * parameters.gripper.radius:
         raise FeatureMissing("the contact area on so small a sphere is unknown")
-    radius = min(gripper.effective_radius, (parameters.substrate.diameter or np.inf) / 2)
-    work.set(adhesion_stress_Pa=work.values["pull_off_force_N"] / (np.pi * radius**2))
-    return {"decision": f"A_c = {np.pi * radius**2 * 1e4:.3f} cm²"}
+    area = full_contact_area(full_contact_radius(parameters)).value
+    work.set(adhesion_stress_Pa=work.values["pull_off_force_N"] / area)
+    return {"decision": f"A_c = {area * 1e4:.3f} cm²"}

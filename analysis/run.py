@@ -33,6 +33,9 @@ class Sensors:
         Relative standard uncertainty of the sensitivity.
     force_linearity, pressure_offset
         Standard uncertainty in N and Pa.
+    force_capacity
+        Of the load cell, N; 0: not known. What its calibration line is out by grows with the load from zero and is
+        fully there at about one per cent of the capacity, the smallest weight of a calibration.
     position
         Standard uncertainty of the stage's position scale, relative.
     pump_volume
@@ -47,6 +50,7 @@ class Sensors:
 
     force_gain: float = 0.0
     force_linearity: float = 0.0
+    force_capacity: float = 0.0
     pressure_gain: float = 0.0
     pressure_offset: float = 0.0
     position: float = 0.0

@@ -55,8 +55,9 @@ class Imperfections:
         Drift of the zero of force, N/s, and the amplitude of its slow waves (about 200, 600 and 1800 s), N.
     creep, creep_time
         Share of a compression that the load train loses to the reading, and the time constant, s (``analysis.creep``).
-    bow
-        What the calibration line is out by under tension and under compression, N.
+    bow, bow_load
+        What the calibration line is out by under tension and under compression, N, and the load by which it has grown
+        to 63 per cent of that, N.
     force_gain, pressure_gain, position_gain
         Errors of the calibrations.
     pressure_offset
@@ -75,6 +76,7 @@ class Imperfections:
     creep: float = 0.0
     creep_time: float = 9.0
     bow: tuple[float, float] = (0.0, 0.0)
+    bow_load: float = 0.05
     force_gain: float = 0.0
     pressure_gain: float = 0.0
     pressure_offset: float = 0.0
@@ -141,7 +143,7 @@ def pull_off_run(
         start += part.size
     time = np.arange(force.size) / test.rate
     measured = force - flaws.creep * delayed(force, 1 / test.rate, flaws.creep_time)
-    measured = measured + np.where(force < 0, *flaws.bow) * np.tanh(50 * np.abs(force) / test.preload)
+    measured = measured + np.where(force < 0, *flaws.bow) * -np.expm1(-np.abs(force) / flaws.bow_load)
     measured = (
         measured * (1 + flaws.force_gain) + 0.05 + _drift(generator, time, flaws) + _noise(generator, force.size, flaws)
     )

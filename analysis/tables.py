@@ -4,19 +4,37 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
-from analysis.derived import adhesion_efficiency, adhesion_stress, enhancement_ratio, full_contact_area
+from analysis.derived import (
+    adhesion_efficiency,
+    adhesion_stress,
+    enhancement_ratio,
+    full_contact_area,
+    full_contact_radius,
+)
+from analysis.published import TABLE_S3, TABLE_S4, JkrTable
 from analysis.quantity import Quantity, with_uncertainty
 from analysis.repeats import Group, Pooled
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RIGID_ADHESION_STRESS = Quantity(100.8e3, math.nan, "Pa", "sigma_ad of the rigid system, Table S3 as published")
-SOFT_ADHESION_STRESS = Quantity(72.5e3, math.nan, "Pa", "sigma_ad of the soft system, Table S4 as published")
+
+def _published_stress(table: JkrTable, system: str) -> Quantity:
+    """Return the printed sigma_ad; uncertain by the scatter of the positions' forces and areas, as a mean is."""
+    forces = [float(force) for _, force, _ in table.rows]
+    areas = [float(area) for _, _, area in table.rows if area is not None]
+    value = float(table.stress) * 1e3
+    relative = math.hypot(*(stdev(found) / mean(found) / math.sqrt(len(found)) for found in (forces, areas)))
+    return Quantity(value, value * relative, "Pa", f"σ_ad of the {system} system, Table {table.name} as published")
+
+
+RIGID_ADHESION_STRESS = _published_stress(TABLE_S3, "rigid")
+SOFT_ADHESION_STRESS = _published_stress(TABLE_S4, "soft")
 PUBLISHED_STRESS = {"rigid": RIGID_ADHESION_STRESS, "soft": SOFT_ADHESION_STRESS}
 
 NOT_AVAILABLE = "N/A"
@@ -99,47 +117,51 @@ def characterization(groups: Iterable[Group], gripper: str = "rigid", reference:
         gripper, f"Table S2 | Characterization results of the {gripper} adhesion system"
     )
     notes = (
-        f"Efficiencies against σ_ad = {stress.value / 1e3:.1f} kPa ({stress.explanation}).",
-        "Forces: mean ± standard uncertainty of the mean. Stress is F_off / (π r_e²).",
+        f"Efficiencies against σ_ad = {_text(stress, 1e-3)} kPa ({stress.explanation}).",
+        "Forces: mean ± standard uncertainty of the mean. Stress is F_off / (π r_e²), r_e with its uncertainty.",
+        "A single pressure counts as the lowest where it is suction, and as the highest otherwise.",
     )
     return Table(name, ("Characterization Parameters", *cells), rows, notes)
 
 
 def _column(groups: Sequence[Group], reference: Quantity) -> tuple[str, ...]:
     by_force = sorted(groups, key=lambda members: _mean(members, "pull_off_force_N").value)
-    least, largest = by_force[0], by_force[-1]
-    low, high = _mean(least, "pull_off_force_N"), _mean(largest, "pull_off_force_N")
-    pressures = [_mean(m, "initial_pressure_Pa") for m in groups if m.pooled("initial_pressure_Pa")]
-    pressures.sort(key=lambda pressure: pressure.value)
-    area = _area(least)
-    counts = ", ".join(str(len(members.kept)) for members in (least, largest))
-    head = (
+    area = _area(by_force[0])
+    ends: tuple[Group | None, Group | None] = (by_force[0], by_force[-1])
+    if len(groups) == 1:
+        gas = groups[0].pooled("initial_pressure_Pa")
+        ends = (None, groups[0]) if gas is not None and gas.mean < 0 else (groups[0], None)
+    forces = [None if members is None else _mean(members, "pull_off_force_N") for members in ends]
+    stresses = [None if force is None or area is None else adhesion_stress(force, area) for force in forces]
+    low, high = forces
+    return (
         NOT_AVAILABLE if area is None else f"{area.value * 1e4:.2f}",
-        _text(pressures[-1], 1e-3) if pressures else NOT_AVAILABLE,
-        _text(pressures[0], 1e-3) if pressures else NOT_AVAILABLE,
-        _text(low),
-        _text(high),
-        NOT_AVAILABLE if least is largest else _text(enhancement_ratio(high, low)),
+        *(_optional(pressure, 1e-3) for pressure in _pressures(groups, ends)),
+        *map(_optional, forces),
+        NOT_AVAILABLE if low is None or high is None else _text(enhancement_ratio(high, low)),
+        *(_optional(stress, 1e-3) for stress in stresses),
+        *(_optional(None if s is None else adhesion_efficiency(s, reference), 100) for s in stresses),
+        ", ".join(NOT_AVAILABLE if members is None else str(len(members.kept)) for members in ends),
     )
-    if area is None:
-        return (*head, *[NOT_AVAILABLE] * 4, counts)
-    stresses = [adhesion_stress(force, area) for force in (low, high)]
-    efficiencies = [adhesion_efficiency(stress, _certain(reference)) for stress in stresses]
-    return (*head, *(_text(s, 1e-3) for s in stresses), *(_text(e, 100) for e in efficiencies), counts)
+
+
+def _pressures(groups: Sequence[Group], ends: tuple[Group | None, Group | None]) -> tuple[Quantity | None, ...]:
+    """Return the highest and the lowest initial pressure; where there is but one, at the end it stands for."""
+    found = [_mean(members, "initial_pressure_Pa") for members in groups if members.pooled("initial_pressure_Pa")]
+    found.sort(key=lambda pressure: pressure.value)
+    if len(found) < 2:
+        only = found[0] if found else None
+        return (None, only) if ends[0] is None else (only, None)
+    return found[-1], found[0]
 
 
 def _area(members: Group) -> Quantity | None:
-    """Return pi r_e^2 where the contact is full (as ``analysis.retraction.stress`` decides), else ``None``."""
-    if members.pooled("adhesion_stress_Pa") is None:
+    """Return the area of the full contact (as ``analysis.retraction.stress`` decides), or ``None``."""
+    run = members.kept[0].run
+    if members.pooled("adhesion_stress_Pa") is None or run.parameters is None:
         return None
-    parameters = members.kept[0].run.parameters
-    return None if parameters is None else full_contact_area(parameters.gripper.effective_radius)
-
-
-def _certain(quantity: Quantity) -> Quantity:
-    """A published value without a stated uncertainty adds none."""
-    uncertainty = quantity.uncertainty if math.isfinite(quantity.uncertainty) else 0.0
-    return Quantity(quantity.value, uncertainty, quantity.unit, quantity.explanation)
+    uncertainty = float(run.settings.get("effective_radius_uncertainty_mm", 0.0)) * 1e-3
+    return full_contact_area(full_contact_radius(run.parameters), uncertainty)
 
 
 def _mean(members: Group, feature: str) -> Quantity:
@@ -149,11 +171,15 @@ def _mean(members: Group, feature: str) -> Quantity:
 
 
 def _quantity(pooled: Pooled) -> Quantity:
-    return Quantity(pooled.mean, pooled.uncertainty, pooled.unit)
+    return Quantity(pooled.mean, pooled.uncertainty, pooled.unit, budget=pooled.budget)
 
 
 def _text(quantity: Quantity, factor: float = 1.0) -> str:
     return with_uncertainty(quantity.value * factor, quantity.uncertainty * factor)
+
+
+def _optional(quantity: Quantity | None, factor: float = 1.0) -> str:
+    return NOT_AVAILABLE if quantity is None else _text(quantity, factor)
 
 
 def jkr_summary(groups: Iterable[Group], gripper: str = "rigid") -> Table:
@@ -178,11 +204,10 @@ def jkr_summary(groups: Iterable[Group], gripper: str = "rigid") -> Table:
     works = [_mean(m, "work_of_adhesion_J_m2") for m in found if m.pooled("work_of_adhesion_J_m2")]
     rows.append(("AVG.", _average_text(forces, 1e3), _average_text(areas, 1e6)))
     rows.append(("Work of Adhesion, ω_ad [J·m⁻²]", _average_text(works), ""))
-    if areas:
-        stress = adhesion_stress(_average(forces), _average(areas))
-        same = adhesion_stress(_average([_mean(m, "pull_off_force_N") for m in both]), _average(areas))
-        rows.append(("Adhesion Stress, σ_ad [kPa]", _text(stress, 1e-3), ""))
-        rows.append(("Adhesion Stress, positions with an area alone [kPa]", _text(same, 1e-3), ""))
+    stress = adhesion_stress(_average(forces), _average(areas)) if areas else None
+    same = adhesion_stress(_average([_mean(m, "pull_off_force_N") for m in both]), _average(areas)) if areas else None
+    rows.append(("Adhesion Stress, σ_ad [kPa]", _optional(stress, 1e-3), ""))
+    rows.append(("Adhesion Stress, positions with an area alone [kPa]", _optional(same, 1e-3), ""))
     number = "S3" if gripper == "rigid" else "S4"
     title = f"Table {number} | Summary of F_off, ω_ad and σ_ad of the FAM for the {gripper} adhesion system"
     header = ("Position", "Pull-off force, F_off [mN]", "Projected Contact Area, A_pc [mm²]")
@@ -191,16 +216,18 @@ def jkr_summary(groups: Iterable[Group], gripper: str = "rigid") -> Table:
 
 def _pooled_text(members: Group, feature: str, factor: float) -> str:
     pooled = members.pooled(feature)
-    return "" if pooled is None else _text(_quantity(pooled), factor)
+    return _optional(None if pooled is None else _quantity(pooled), factor)
 
 
 def _average(quantities: Sequence[Quantity]) -> Quantity:
-    """Mean over positions; the positions' spread is part of its uncertainty."""
+    """Mean over positions; their spread is part of its uncertainty, and what calibration they share does not shrink."""
     n = len(quantities)
-    mean = sum(q.value for q in quantities) / n
-    own = math.sqrt(sum(q.uncertainty**2 for q in quantities)) / n
-    spread = math.sqrt(sum((q.value - mean) ** 2 for q in quantities) / (n - 1) / n) if n > 1 else 0.0
-    return Quantity(mean, max(own, spread), quantities[0].unit)
+    value = sum(q.value for q in quantities) / n
+    random = [q.budget.get("repeats", q.uncertainty) for q in quantities]
+    own = math.hypot(*random) / n
+    spread = math.sqrt(sum((q.value - value) ** 2 for q in quantities) / (n - 1) / n) if n > 1 else 0.0
+    common = [math.sqrt(max(0.0, q.uncertainty**2 - r**2)) for q, r in zip(quantities, random, strict=True)]
+    return Quantity(value, math.hypot(max(own, spread), sum(common) / n), quantities[0].unit)
 
 
 def _average_text(quantities: Sequence[Quantity], factor: float = 1.0) -> str:
@@ -209,47 +236,52 @@ def _average_text(quantities: Sequence[Quantity], factor: float = 1.0) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FiberSample:
-    """A sample of the single-fibre test: name, F_off, real and projected contact area of its fibres (N, m^2)."""
+    """A sample of the single-fibre test: name, F_off, real and projected contact area of its fibres, where measured."""
 
     name: str
     force: Quantity
-    real_area: float
-    projected_area: float
+    real_area: Quantity | None
+    projected_area: Quantity | None
     fibers: int = 3
 
 
 def fiber_samples(groups: Iterable[Group]) -> list[FiberSample]:
-    """Return the samples of the protocol ``fiber``; areas: ``real_area_um2``, ``projected_area_um2`` of the scene."""
+    """Return the samples of the protocol ``fiber``."""
     found = []
     for members in groups:
         if members.condition.protocol != "fiber" or members.pooled("pull_off_force_N") is None:
             continue
-        settings: Mapping[str, float | str] = members.kept[0].run.settings
-        real, projected = (
-            float(settings.get(key, math.nan)) * 1e-12 for key in ("real_area_um2", "projected_area_um2")
-        )
+        areas = [members.pooled(name) for name in ("real_area_m2", "projected_area_m2")]
+        real, projected = (None if area is None else _quantity(area) for area in areas)
         force = _mean(members, "pull_off_force_N")
-        found.append(FiberSample(members.condition.place, force, real, projected, int(settings.get("fibers", 3))))
+        fibers = int(members.kept[0].run.settings.get("fibers", 3))
+        found.append(FiberSample(members.condition.place, force, real, projected, fibers))
     return found
 
 
 def fiber_summary(samples: Sequence[FiberSample]) -> Table:
-    """Return Table S5: adhesion and areas by sample, then single-fibre force, area and stresses."""
-    force = _average([sample.force for sample in samples])
-    real = sum(sample.real_area for sample in samples) / len(samples)
-    projected = sum(sample.projected_area for sample in samples) / len(samples)
+    """Return Table S5: adhesion and areas by sample, then single-fibre force, area and stresses.
+
+    Stresses take force and area of the samples that have the area.
+    """
     fibers = samples[0].fibers
-    rows = [
-        (s.name, _text(s.force, 1e3), f"{s.real_area * 1e12:.1f}", f"{s.projected_area * 1e12:.1f}") for s in samples
+    force = _average([sample.force for sample in samples])
+    real = [(s.force, s.real_area) for s in samples if s.real_area is not None]
+    projected = [(s.force, s.projected_area) for s in samples if s.projected_area is not None]
+    areas = [_average([area for _, area in found]) if found else None for found in (real, projected)]
+    stresses = [
+        None if area is None else adhesion_stress(_average([force for force, _ in found]), area)
+        for found, area in zip((real, projected), areas, strict=True)
     ]
-    rows.append(("AVG.", _text(force, 1e3), f"{real * 1e12:.1f}", f"{projected * 1e12:.1f}"))
-    single = Quantity(force.value / fibers, force.uncertainty / fibers, "N")
-    of_real, of_projected = (Quantity(force.value / area, force.uncertainty / area, "Pa") for area in (real, projected))
+    rows: list[tuple[str, ...]] = [
+        (s.name, _text(s.force, 1e3), _optional(s.real_area, 1e12), _optional(s.projected_area, 1e12)) for s in samples
+    ]
     rows += [
-        ("Single Fiber Adhesion, F_off|sf [mN]", _text(single, 1e3), "", ""),
-        ("Single Fiber Real Contact Area, A_rc|sf [µm²]", f"{real / fibers * 1e12:.1f}", "", ""),
-        ("Single Fiber Adhesion Stress, σ_ad|sf [kPa]", _text(of_real, 1e-3), "", ""),
-        (f"{fibers} Fibers Adhesion Stress, σ_ad|{fibers}f [kPa]", _text(of_projected, 1e-3), "", ""),
+        ("AVG.", _text(force, 1e3), *(_optional(area, 1e12) for area in areas)),
+        ("Single Fiber Adhesion, F_off|sf [mN]", _text(force, 1e3 / fibers), "", ""),
+        ("Single Fiber Real Contact Area, A_rc|sf [µm²]", _optional(areas[0], 1e12 / fibers), "", ""),
+        ("Single Fiber Adhesion Stress, σ_ad|sf [kPa]", _optional(stresses[0], 1e-3), "", ""),
+        (f"{fibers} Fibers Adhesion Stress, σ_ad|{fibers}f [kPa]", _optional(stresses[1], 1e-3), "", ""),
     ]
     header = ("Sample", "Adhesion, F_off [mN]", "Real Contact Area, A_rc [µm²]", "Projected Contact Area, A_pc [µm²]")
     title = "Table S5 | F_off, A_c and σ_ad of a single fiber and small area of microfiber array"

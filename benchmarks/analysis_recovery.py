@@ -29,6 +29,7 @@ from analysis.coverage import summary
 from analysis.numerics import Array
 from drivers.emulated.bench import EmulatedBench
 from drivers.emulated.electronics import Cell, Device, PressureSensor, usb_6211
+from drivers.emulated.indentation import Indentation
 from drivers.emulated.plant import Plant
 from drivers.emulated.truth import Truth
 from model.jkr import work_of_adhesion_jkr
@@ -134,13 +135,14 @@ def world(scene: Scene, bench: Bench, draw: Random, seed: int) -> Truth:
 
 @dataclass(frozen=True, slots=True)
 class BentCell(Cell):
-    """A load cell whose line is out by ``bow`` (N) under tension and under compression."""
+    """A load cell whose line is out by ``bow`` (N) under tension and under compression, 63 % of it at ``bow_load``."""
 
     bow: tuple[float, float] = (0.0, 0.0)
+    bow_load: float = 0.05
 
     def output(self, force: Array, bridge: bool) -> Array:
         """Return the noise-free signal of the bent line."""
-        bent = np.where(force < 0, *self.bow) * np.tanh(np.abs(force) / (0.01 * self.capacity))
+        bent = np.where(force < 0, *self.bow) * -np.expm1(-np.abs(force) / self.bow_load)
         return Cell.output(self, force + bent, bridge)
 
 
@@ -155,6 +157,7 @@ def instruments(bench: Bench, draw: Random) -> Device:
         linearity=0.0,
         noise=4e-5 * force.capacity_N,
         bow=(known.force_linearity * draw.normal(), known.force_linearity * draw.normal()),
+        bow_load=force.capacity_N * 0.01 * 2 ** float(draw.uniform(-1, 1)),
     )
     sensor = PressureSensor()
     span = 2 * sensor.full_scale
@@ -259,8 +262,14 @@ def true_features(test: Test) -> dict[str, float]:
     }
     if test.run.protocol == "pull_off":
         return found | {"initial_pressure_Pa": float(pressure[0])}
-    sphere = float(getattr(test.truth.specimen, "sphere_radius"))  # noqa: B009
-    return found | {"work_of_adhesion_J_m2": work_of_adhesion_jkr(-float(force[lowest]), sphere)}
+    specimen = test.truth.specimen
+    assert isinstance(specimen, Indentation)
+    work = work_of_adhesion_jkr(-float(force[lowest]), specimen.sphere_radius)
+    return found | {
+        "work_of_adhesion_J_m2": work,
+        "fitted_work_of_adhesion_J_m2": work,
+        "fitted_modulus_Pa": specimen.modulus,
+    }
 
 
 def one(kind: str, seed: int) -> dict[str, list[float]]:

@@ -42,7 +42,9 @@ def _settings(recording: Recording) -> dict[str, float | str]:
     settings: dict[str, float | str] = {
         key: value for key, value in protocol.model_dump().items() if isinstance(value, int | float | str)
     }
-    settings["gripper"] = recording.scene.gripper.kind
+    gripper = recording.scene.gripper
+    settings["gripper"] = gripper.kind
+    settings["effective_radius_uncertainty_mm"] = gripper.effective_radius_uncertainty_mm
     place = recording.configuration.get("place", "")
     if place:
         settings["sample" if protocol.name == "fiber" else "position"] = place
@@ -70,6 +72,7 @@ def sensors(bench: Bench) -> Sensors:
     return Sensors(
         force_gain=calibration.relative_uncertainty,
         force_linearity=calibration.residual,
+        force_capacity=bench.force.capacity_N,
         pressure_gain=pressure.relative_uncertainty if pressure else 0.0025 * rectangular,
         pressure_offset=pressure.residual if pressure else 300.0 * rectangular,
         position=1e-5,

@@ -40,6 +40,7 @@ class GripperSection(Section):
     kind: Literal["rigid", "soft", "punch"] = "rigid"
     radius_mm: Annotated[float, Field(gt=0, le=1e3)] = 8.0
     effective_radius_mm: Annotated[float, Field(gt=0, le=1e3)] = 7.3
+    effective_radius_uncertainty_mm: Annotated[float, Field(ge=0, le=1e3)] = 0.1
     chamber_volume_ml: Annotated[float, Field(gt=0, le=1e9)] = 7.2
 
     @model_validator(mode="after")
@@ -48,6 +49,11 @@ class GripperSection(Section):
             raise ValueError(
                 f"effective_radius_mm = {self.effective_radius_mm:g} exceeds radius_mm = {self.radius_mm:g}; "
                 "the contact cannot be wider than the gripper"
+            )
+        if self.effective_radius_uncertainty_mm > self.effective_radius_mm / 2:
+            raise ValueError(
+                f"effective_radius_uncertainty_mm = {self.effective_radius_uncertainty_mm:g} exceeds half of "
+                f"effective_radius_mm = {self.effective_radius_mm:g}"
             )
         return self
 
@@ -94,7 +100,9 @@ class IndentationSection(ContactSection):
     retract_speed_um_s: Annotated[float, Field(gt=0, le=1000)] = 50.0
     contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 3.0
     indenter_radius_mm: Annotated[float, Field(gt=0, le=1000)] = 4.0
+    indenter_radius_uncertainty_mm: Annotated[float, Field(ge=0, le=1000)] = 0.02
     contact_area_mm2: Annotated[float, Field(gt=0)] | None = None
+    contact_area_uncertainty_mm2: Annotated[float, Field(ge=0)] | None = None
     positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
         "top",
         "center",
@@ -115,7 +123,9 @@ class FiberSection(ContactSection):
     contact_force_mN: Annotated[float, Field(gt=0, le=1000)] = 0.15
     fibers: Annotated[int, Field(ge=1)] = 3
     real_area_um2: Annotated[float, Field(gt=0)] | None = None
+    real_area_uncertainty_um2: Annotated[float, Field(ge=0)] | None = None
     projected_area_um2: Annotated[float, Field(gt=0)] | None = None
+    projected_area_uncertainty_um2: Annotated[float, Field(ge=0)] | None = None
     positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = ("SPL#1", "SPL#2", "SPL#3")
     repeats: Annotated[int, Field(ge=1, le=1000)] = 5
 
@@ -125,6 +135,7 @@ class PunchSection(ContactSection):
 
     name: Literal["punch"]
     contact_area_mm2: Annotated[float, Field(gt=0)] | None = None
+    contact_area_uncertainty_mm2: Annotated[float, Field(ge=0)] | None = None
 
 
 class VolumeSection(Section):

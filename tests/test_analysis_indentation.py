@@ -66,6 +66,21 @@ def test_area_from_the_still_image_gives_the_stress() -> None:
     assert "still image" in analyze(indentation_run(), uncertainties=False).features.missing["projected_area_m2"]
 
 
+def test_area_and_radius_are_in_the_budgets() -> None:
+    features = analyze(
+        indentation_run(contact_area_mm2=0.78, contact_area_uncertainty_mm2=0.0156, indenter_radius_uncertainty_mm=0.04)
+    ).features
+    assert features["projected_area_m2"].uncertainty == pytest.approx(0.0156e-6)
+    stress = features["contact_stress_Pa"]
+    assert stress.budget["contact area"] == pytest.approx(0.02 * stress.value, rel=0.03)
+    for name in ("work_of_adhesion_J_m2", "fitted_work_of_adhesion_J_m2"):
+        work = features[name]
+        assert work.budget["indenter radius"] == pytest.approx(0.01 * work.value, rel=0.2)
+    assert "indenter radius" not in features["pull_off_force_N"].budget
+    unstated = analyze(indentation_run(contact_area_mm2=0.78)).features["projected_area_m2"]
+    assert unstated.uncertainty == pytest.approx(0.05 * unstated.value)
+
+
 def test_without_a_radius_there_is_no_work_of_adhesion() -> None:
     run = replace(indentation_run(), settings={})
     features = analyze(run, uncertainties=False).features

@@ -82,9 +82,51 @@ def test_table_s1_has_the_papers_rows_and_values() -> None:
 def test_cells_carry_their_uncertainty() -> None:
     parameters = Parameters(Substrate("flat"), gas=Gas(initial_pressure=1600.0))
     table = characterization(group([analyze(run_of(0.52, parameters=parameters))]))
-    assert "±" in cell(table, "Max. Pull-off", "Flat Glass")
-    assert "±" in cell(table, "Max. Adhesion Efficiency", "Flat Glass")
-    assert cell(table, "Enhancing", "Flat Glass") == "N/A"  # one pressure has no ratio
+    assert "±" in cell(table, "Min. Pull-off", "Flat Glass")
+    assert "±" in cell(table, "Min. Adhesion Efficiency", "Flat Glass")
+
+
+@pytest.mark.parametrize(("pressure", "measured"), [(1600.0, ("Highest", "Min.")), (-2900.0, ("Lowest", "Max."))])
+def test_one_pressure_fills_one_end_of_table_s1(pressure: float, measured: tuple[str, str]) -> None:
+    parameters = Parameters(Substrate("flat"), gas=Gas(initial_pressure=pressure))
+    table = characterization(group([analyze(run_of(0.52, parameters=parameters), uncertainties=False)]))
+    cells = {name: text for name, text in table.rows if name.startswith(("Highest", "Lowest", "Min.", "Max."))}
+    assert {name for name, text in cells.items() if text != "N/A"} == {n for n in cells if n.startswith(measured)}
+    assert cell(table, "Enhancing", "Flat Glass") == "N/A"
+    assert cell(table, "Contact Area", "Flat Glass") == "1.67"
+
+
+def test_stress_and_efficiency_carry_the_contact_radius_and_the_published_stress() -> None:
+    parameters = Parameters(Substrate("flat"), gas=Gas(initial_pressure=1600.0))
+    run = run_of(0.52, parameters=parameters, effective_radius_uncertainty_mm=0.1)
+    analysis = analyze(run)
+    stress = analysis.features["adhesion_stress_Pa"]
+    assert stress.budget["effective radius"] == pytest.approx(stress.value * 2 * 0.1 / 7.3, rel=0.03)
+    assert "effective radius" not in analysis.features["pull_off_force_N"].budget
+    table = characterization(group([analysis]))
+    text = cell(table, "Min. Adhesion Stress", "Flat Glass")
+    assert float(text.partition("±")[2]) == pytest.approx(stress.uncertainty / 1e3, rel=0.1)
+    value, _, uncertainty = cell(table, "Min. Adhesion Efficiency", "Flat Glass").partition("±")
+    scatter = np.std([66.3, 82.1, 80.6, 82.4, 78.8], ddof=1) / np.sqrt(5) / 78.04
+    assert float(uncertainty) / float(value) == pytest.approx(np.hypot(2 * 0.1 / 7.3, scatter), rel=0.1)
+
+
+def test_the_gain_cancels_in_the_ratio_of_table_s1() -> None:
+    runs = [
+        run_of(force, parameters=Parameters(Substrate("flat"), gas=Gas(initial_pressure=pressure)), seed=seed)
+        for force, pressure in ((0.52, 1600.0), (1.12, -2900.0))
+        for seed in range(2)
+    ]
+    table = characterization(group(analyze(replace(run, sensors=Sensors(force_gain=0.05))) for run in runs))
+    ratio, _, uncertainty = cell(table, "Enhancing", "Flat Glass").partition("±")
+    assert float(uncertainty) < 0.01 * float(ratio)
+
+
+def test_a_small_disk_is_the_contact() -> None:
+    parameters = Parameters(Substrate("flat", 10e-3), gas=Gas(initial_pressure=1600.0))
+    table = characterization(group([analyze(run_of(0.3, parameters=parameters), uncertainties=False)]))
+    assert cell(table, "Contact Area", "flat disk 10 mm") == "0.79"
+    assert number(cell(table, "Min. Adhesion Stress", "flat disk 10 mm")) == pytest.approx(3.82, rel=0.02)
 
 
 def test_table_s2_is_the_soft_gripper() -> None:
@@ -107,7 +149,26 @@ def test_tables_s3_and_s4_keep_the_populations_apart() -> None:
     assert number(cell(table, "Work of Adhesion", force)) == pytest.approx(4.14, rel=0.01)
     assert number(cell(table, "Adhesion Stress, σ_ad", force)) == pytest.approx(100.9, rel=0.01)
     assert number(cell(table, "Adhesion Stress, positions", force)) == pytest.approx(104.2, rel=0.01)
-    assert cell(table, "Top", "Projected Contact Area, A_pc [mm²]") == ""
+    assert cell(table, "Top", "Projected Contact Area, A_pc [mm²]") == "N/A"
+
+
+def test_tables_s3_without_areas_says_so_in_every_cell() -> None:
+    runs = [run_of(0.08, parameters=None, protocol="indentation", position="top", indenter_radius_mm=4.0)]
+    table = jkr_summary(group(analyze(run, uncertainties=False) for run in runs))
+    area = "Projected Contact Area, A_pc [mm²]"
+    assert (cell(table, "top", area), cell(table, "AVG.", area)) == ("N/A", "N/A")
+    assert cell(table, "Adhesion Stress, σ_ad", "Pull-off force, F_off [mN]") == "N/A"
+
+
+def test_what_positions_share_does_not_shrink_in_their_mean() -> None:
+    settings = {"indenter_radius_mm": 4.0, "indenter_radius_uncertainty_mm": 0.04}
+    runs = [
+        run_of(0.08, parameters=None, protocol="indentation", seed=seed, position=str(seed), **settings)
+        for seed in range(4)
+    ]
+    table = jkr_summary(group(analyze(run) for run in runs))
+    work, _, uncertainty = cell(table, "Work of Adhesion", "Pull-off force, F_off [mN]").partition("±")
+    assert float(uncertainty) / float(work) == pytest.approx(0.01, rel=0.2)
 
 
 def test_table_s5_from_fibre_samples() -> None:
@@ -127,10 +188,24 @@ def test_table_s5_from_fibre_samples() -> None:
     force = "Adhesion, F_off [mN]"
     assert number(cell(table, "AVG.", force)) == pytest.approx(1.867, rel=0.01)
     assert number(cell(table, "Single Fiber Adhesion, F", force)) == pytest.approx(0.622, rel=0.01)
-    assert cell(table, "AVG.", "Real Contact Area, A_rc [µm²]") == "12930.1"
+    assert number(cell(table, "AVG.", "Real Contact Area, A_rc [µm²]")) == pytest.approx(12930.1, rel=1e-4)
     assert number(cell(table, "Single Fiber Adhesion Stress", force)) == pytest.approx(144.4, rel=0.01)
     assert number(cell(table, "3 Fibers", force)) == pytest.approx(89.9, rel=0.01)
     assert [t.title for t in all_tables(groups)] == [table.title]
+
+
+def test_table_s5_without_areas_holds_no_nan() -> None:
+    runs = [
+        run_of(2e-3, parameters=None, protocol="fiber", sample="SPL#1"),
+        run_of(2e-3, parameters=None, protocol="fiber", sample="SPL#2", real_area_um2=13000.0),
+    ]
+    table = fiber_summary(fiber_samples(group(analyze(run) for run in runs)))
+    assert "nan" not in table.markdown()
+    assert cell(table, "SPL#1", "Real Contact Area, A_rc [µm²]") == "N/A"
+    assert cell(table, "SPL#2", "Real Contact Area, A_rc [µm²]") == "13000 ± 650"
+    force = "Adhesion, F_off [mN]"
+    assert number(cell(table, "Single Fiber Adhesion Stress", force)) == pytest.approx(154, rel=0.01)
+    assert cell(table, "3 Fibers", force) == "N/A"
 
 
 def test_tables_render_and_escape() -> None:

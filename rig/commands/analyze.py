@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from analysis.batch import Analyzed
     from analysis.report import Source
+    from rig.areas import Areas
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pdf", type=Path, metavar="PDF", help="write the report as PDF")
     parser.add_argument("--curves", type=Path, metavar="DIR", help="write each curve, and each mean of repeats, as CSV")
     parser.add_argument("--afm", type=Path, metavar="DIR", help="write each run as .tab for afmformats, nanite, PyJibe")
+    parser.add_argument("--areas", type=Path, metavar="CSV", help="contact areas by recording (rig contact-area)")
     parser.add_argument("--model", choices=MODELS, default="cone", help="model drawn over the data")
     parser.add_argument("--title", default="Pull-off tests", help="title of the report")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core)")
@@ -54,10 +56,23 @@ def run(arguments: argparse.Namespace) -> int:
         pictures=wants_pictures,
         jobs=arguments.jobs,
         scheduler=arguments.scheduler,
+        areas=_areas(arguments),
     )
     _write(arguments, runs)
     _print(arguments, runs)
     return 0
+
+
+def _areas(arguments: argparse.Namespace) -> Areas:
+    """Read the areas file; say which of its recordings are not analysed."""
+    from rig.areas import read_areas, strangers
+
+    if arguments.areas is None:
+        return {}
+    areas = read_areas(arguments.areas)
+    for name in strangers(areas, (path.stem for path in arguments.recordings)):
+        print(f"rig analyze: {arguments.areas}: {name} is not among the recordings", file=sys.stderr)
+    return areas
 
 
 def _calibrations(arguments: argparse.Namespace) -> bool:
@@ -85,6 +100,7 @@ def analyze_files(
     pictures: bool = False,
     jobs: int | None = None,
     scheduler: str | None = None,
+    areas: Areas | None = None,
 ) -> list[Analyzed]:
     """Analyse recordings, with progress on standard error; on several processes where there are more than three."""
     from tqdm import tqdm
@@ -92,18 +108,19 @@ def analyze_files(
     from analysis.batch import on_all_cores
 
     workers = 1 if jobs is None and len(paths) <= 3 else jobs
-    function = partial(analyze_file, model=model, pictures=pictures)
+    function = partial(analyze_file, model=model, pictures=pictures, areas=areas)
     outcomes = on_all_cores(function, paths, workers=workers, scheduler=scheduler)
     quiet = len(paths) < 2 or not sys.stderr.isatty()
     return list(tqdm(outcomes, total=len(paths), unit="run", disable=quiet))
 
 
-def analyze_file(path: Path, *, model: str = "cone", pictures: bool = False) -> Analyzed:
-    """Analyse one recording."""
+def analyze_file(path: Path, *, model: str = "cone", pictures: bool = False, areas: Areas | None = None) -> Analyzed:
+    """Analyse one recording, with the contact areas measured for it since."""
     from analysis.batch import analyze_run
+    from rig.areas import with_area
     from rig.measured import load_run
 
-    return analyze_run(load_run(path), model=model, pictures=pictures)
+    return analyze_run(with_area(load_run(path), areas or {}), model=model, pictures=pictures)
 
 
 def _published(*, as_json: bool) -> int:

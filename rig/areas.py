@@ -1,0 +1,86 @@
+"""Contact areas measured after the test: a CSV file with one line a recording, read beside the recordings."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from analysis.run import Run
+from rig.errors import FileError
+
+SETTINGS = {
+    "area_mm2": "contact_area_mm2",
+    "uncertainty_mm2": "contact_area_uncertainty_mm2",
+    "real_um2": "real_area_um2",
+    "real_uncertainty_um2": "real_area_uncertainty_um2",
+    "projected_um2": "projected_area_um2",
+    "projected_uncertainty_um2": "projected_area_uncertainty_um2",
+}
+"""Columns beside ``recording``, and the key of the scene each one stands for."""
+
+Areas = Mapping[str, Mapping[str, float]]
+"""Settings by the recording's name."""
+
+
+def read_areas(path: Path) -> Areas:
+    """Read an areas file.
+
+    Parameters
+    ----------
+    path
+        CSV with a header: ``recording`` (name, with or without ``.h5``) and any columns of ``SETTINGS``. Empty cells
+        say nothing; of two lines for one recording the later adds to the earlier.
+
+    Raises
+    ------
+    FileError
+        Names the file, the line and the cell that is not an area.
+    """
+    try:
+        lines = csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines(), skipinitialspace=True)
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"{path}: {error}. Remedy: name a CSV file as written by rig contact-area") from error
+    columns = [(name or "").strip() for name in lines.fieldnames or ()]
+    lines.fieldnames = columns
+    unknown = [name for name in columns if name not in SETTINGS and name != "recording"]
+    if "recording" not in columns or unknown:
+        raise FileError(f"{path}: columns {', '.join(columns)}. Remedy: recording and any of {', '.join(SETTINGS)}")
+    found: dict[str, dict[str, float]] = {}
+    for cells in lines:
+        where = f"{path}, line {lines.line_num}"
+        if None in cells:
+            raise FileError(f"{where}: more cells than columns. Remedy: write the decimal point as a point")
+        name = Path((cells["recording"] or "").strip()).name.removesuffix(".h5")
+        settings = {SETTINGS[key]: _area(f"{where}, {key}", text) for key, text in cells.items() if _given(key, text)}
+        if not name:
+            raise FileError(f"{where}: names no recording. Remedy: write its file name into the column recording")
+        found.setdefault(name, {}).update(settings)
+    return found
+
+
+def _given(column: str, text: str | None) -> bool:
+    return column != "recording" and bool((text or "").strip())
+
+
+def _area(where: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or value <= 0:
+        raise FileError(f"{where}: {text.strip()!r} is no area. Remedy: a number above zero")
+    return value
+
+
+def with_area(run: Run, areas: Areas) -> Run:
+    """Return the run with the areas measured for it; they replace those of its scene."""
+    mine = areas.get(run.name)
+    return run if mine is None else replace(run, settings={**run.settings, **mine})
+
+
+def strangers(areas: Areas, names: Iterable[str]) -> list[str]:
+    """Return the recordings of an areas file that are not among ``names``: left out, or misspelt."""
+    return sorted(set(areas) - set(names))

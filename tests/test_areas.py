@@ -1,0 +1,51 @@
+"""Areas measured after the test: the file, and how they reach a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from analysis.synthetic import Profile, pull_off_run
+from rig.areas import read_areas, strangers, with_area
+from rig.errors import FileError
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "areas.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_each_recording_gets_its_own_area(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        "recording, area_mm2, uncertainty_mm2, real_um2, projected_um2\n"
+        "left.h5, 0.78, 0.02,,\nright, 0.76,,,\nspl-1,,,12787.0,20687.3\nleft,0.79,,,\n",
+    )
+    areas = read_areas(path)
+    assert areas["left"] == {"contact_area_mm2": 0.79, "contact_area_uncertainty_mm2": 0.02}
+    assert areas["right"] == {"contact_area_mm2": 0.76}
+    assert areas["spl-1"] == {"real_area_um2": 12787.0, "projected_area_um2": 20687.3}
+    assert strangers(areas, ["left", "spl-1"]) == ["right"]
+    run, _ = pull_off_run(Profile.jkr(4.0, 4e-3, 2e6, 0.095))
+    assert with_area(run, areas) is run
+    assert with_area(run, {run.name: areas["right"]}).settings["contact_area_mm2"] == 0.76
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "recording and any of"),
+        ("recording,area\nleft,1\n", "recording and any of"),
+        ("recording,area_mm2\nleft,0\n", "line 2, area_mm2: '0' is no area"),
+        ("recording,area_mm2\nleft,nan\n", "is no area"),
+        ("recording,area_mm2\nleft,0,78\n", "decimal point"),
+        ("recording,area_mm2\n,0.78\n", "names no recording"),
+    ],
+)
+def test_what_is_no_area_is_refused_by_line(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(FileError, match=words):
+        read_areas(written(tmp_path, text))
+    with pytest.raises(FileError, match=r"nowhere\.csv"):
+        read_areas(tmp_path / "nowhere.csv")
