@@ -8,25 +8,24 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from PySide6.QtCore import QEvent, QObject, Qt, QTimer
-from PySide6.QtGui import QCloseEvent, QKeyEvent, QKeySequence, QShortcut
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QCloseEvent, QKeySequence, QShortcut
 from PySide6.QtWidgets import (
-    QApplication,
     QFileDialog,
     QHBoxLayout,
     QLabel,
     QMainWindow,
-    QPlainTextEdit,
     QProgressBar,
     QPushButton,
-    QToolButton,
     QVBoxLayout,
     QWidget,
 )
 
 from rig.console.checks import Checked, check_scene
 from rig.console.controls import RunControls, Transport, button
+from rig.console.emergency import EmergencyKey
 from rig.console.export import save
+from rig.console.log import EventLog
 from rig.console.panels import (
     PredictionCard,
     PumpCard,
@@ -44,17 +43,16 @@ from rig.console.runner import Child, replay_arguments, run_arguments
 from rig.console.story import Moment, Story
 from rig.console.theme import THEMES, Theme, style_sheet
 from rig.console.timing import durations, time_left, time_to_pull_off
-from rig.console.words import duration, number
+from rig.console.words import duration
 from rig.errors import RigError
 from rig.link import Answer, Link
 from rig.link_address import Address, LinkError, running
-from rig.observe import Event, RunInfo
+from rig.observe import RunInfo
 
 REFRESH_MS = 33
 PICTURES_PER_TEXT = 3
 MESSAGES_PER_REFRESH = 400
 """A console that attaches late catches up over several refreshes and stays usable meanwhile."""
-LOG_LINES = 2000
 
 
 class Console(QMainWindow):
@@ -84,7 +82,6 @@ class Console(QMainWindow):
         self._answers: deque[Callable[[], None]] = deque()
         self._commands = ThreadPoolExecutor(1, thread_name_prefix="console command")
         self._emergencies = ThreadPoolExecutor(2, thread_name_prefix="console emergency stop")
-        self._log_shown: tuple[int, int] = (0, 0)
         self._last_tick = time.monotonic()
         self._refresh_s = REFRESH_MS * 1e-3
         self._build(scenes)
@@ -178,21 +175,7 @@ class Console(QMainWindow):
         self.plots: list[Plot] = [self.force_time, self.force_path, self.pressure_time, self.pressure_path]
         self.readings, self.prediction = Readings(), PredictionCard()
         self.stage, self.pump, self.recording = StageCard(), PumpCard(), RecordingCard()
-        self.log = QPlainTextEdit()
-        self.log.setReadOnly(True)
-        self.log.setMaximumBlockCount(LOG_LINES)
-        self.log.setFixedHeight(118)
-        self.log.setAccessibleName("event log")
-        self.log.setTabChangesFocus(True)
-        self.show_commands = QToolButton(self.log)
-        self.show_commands.setText("commands")
-        self.show_commands.setCheckable(True)
-        self.show_commands.setToolTip("Show every command sent to an instrument as well")
-        self.show_commands.setAccessibleName("show commands in the log")
-        self.show_commands.toggled.connect(self._relog)
-        corner = QVBoxLayout(self.log)
-        corner.addWidget(self.show_commands, 0, Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignTop)
-        corner.setContentsMargins(0, 4, 22, 0)
+        self.log = EventLog()
         left = QVBoxLayout()
         left.setSpacing(8)
         left.addWidget(grid([self.force_path, self.force_time], [self.pressure_path, self.pressure_time]), 1)
@@ -360,7 +343,7 @@ class Console(QMainWindow):
         for plot in self.plots:
             plot.clear()
         self.log.clear()
-        self._log_shown = (0, 0)
+        self.log.forget()
         for widget in (self.words, self.clock, self.left):
             widget.setText("")
 
@@ -541,7 +524,7 @@ class Console(QMainWindow):
         self.pump.show_moment(moment)
         self.recording.show_moment(moment, story)
         self._show_times(story, moment)
-        self._show_log(story, moment)
+        self.log.show_moment(moment, story)
         self._show_status(story, moment)
         self._show_state(story, moment)
 
@@ -558,26 +541,6 @@ class Console(QMainWindow):
             self.progress.setRange(0, 1000)
             self.progress.setValue(int(1000 * (repeat - 1 + min(1.0, part)) / repeats))
             self.progress.setFormat(f"test {repeat} of {repeats}")
-
-    def _show_log(self, story: Story, moment: Moment) -> None:
-        shown, missed = self._log_shown
-        if moment.events < shown:  # the playhead went back
-            self.log.clear()
-            shown = 0
-        for event in story.events[max(shown, moment.events - LOG_LINES) : moment.events]:
-            if event.kind != "command" or self.show_commands.isChecked():
-                self.log.appendPlainText(_line(event, story.rate))
-        if moment.events != shown:
-            self.log.verticalScrollBar().setValue(self.log.verticalScrollBar().maximum())
-        if story.missed != missed:
-            self.log.appendPlainText(f"{story.missed - missed} messages were missed by this console (not by the run)")
-        self._log_shown = (moment.events, story.missed)
-
-    def _relog(self) -> None:
-        """Write the log anew."""
-        if self.story is not None:
-            self.log.clear()
-            self._log_shown = (0, self._log_shown[1])
 
     def _show_status(self, story: Story, moment: Moment) -> None:
         prediction = moment.prediction
@@ -677,38 +640,6 @@ class Console(QMainWindow):
         self._commands.shutdown(wait=False, cancel_futures=True)
         self._emergencies.shutdown(wait=True)
         event.accept()
-
-
-class EmergencyKey(QObject):
-    """Catches Esc before any dialog or widget does."""
-
-    def __init__(self, console: Console) -> None:
-        super().__init__(console)
-        self._console = console
-        application = QApplication.instance()
-        if application is not None:
-            application.installEventFilter(self)
-
-    def remove(self) -> None:
-        """Stop catching."""
-        application = QApplication.instance()
-        if application is not None:
-            application.removeEventFilter(self)
-
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """See ``QObject``."""
-        if event.type() != QEvent.Type.KeyPress or not isinstance(event, QKeyEvent):
-            return False
-        if event.key() != Qt.Key.Key_Escape or not self._console.emergency.isEnabled():
-            return False
-        if not event.isAutoRepeat():
-            self._console.emergency_stop()
-        return True
-
-
-def _line(event: Event, rate: float) -> str:
-    mark = {"fault": "\u2715 ", "interlock": "\u2715 ", "warning": "\u26a0 "}.get(event.kind, "")
-    return f"{number(event.sample / rate, 2):>9} s  {mark}{event.kind:<9} {event.text}"
 
 
 def _sentence(text: str) -> str:
