@@ -11,7 +11,7 @@ import numpy as np
 from analysis.derived import validity
 from analysis.errors import FeatureMissing
 from analysis.extraction import Details, Extraction, extraction_step
-from analysis.numerics import Array, block_means
+from analysis.numerics import RECTANGULAR, Array, block_means
 from analysis.run import Run
 from model import jkr
 
@@ -338,7 +338,7 @@ def contact_models(work: Extraction) -> Details:
         value, other, third = (float(getattr(fit, key)) for fit in (best, narrow, rival))
         work.set(**{name: value})
         own = float(getattr(best, f"{key}_uncertainty"))
-        work.stated[name] = math.hypot(own, value - other, plausible * (value - third))
+        work.stated[name] = math.hypot(own, (value - other) / RECTANGULAR, plausible * (value - third))
     words = "; ".join(
         f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in (best, rival)
     )

@@ -158,7 +158,7 @@ def _held(work: Extraction, last: int) -> tuple[float, float]:
     before = float(work.force[last - 1] - work.force[last - 4]) / 3
     growth = (fall - before - 3 * work.noise.sigma) / fall if fall > 0 else 0.0  # two deviations of that difference
     held = left * (1 - min(max(growth, 0.0), 1.0))
-    return held, abs(held - seen) / 3
+    return held, abs(held - seen) / RECTANGULAR
 
 
 def _last_tense(work: Extraction, jump: ForceJump) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from analysis.quantity import Quantity
 from analysis.run import Run
 from rig.errors import FileError
 
@@ -84,3 +85,30 @@ def with_area(run: Run, areas: Areas) -> Run:
 def strangers(areas: Areas, names: Iterable[str]) -> list[str]:
     """Return the recordings of an areas file that are not among ``names``: left out, or misspelt."""
     return sorted(set(areas) - set(names))
+
+
+def area_line(recording: str, area: Quantity) -> str:
+    """Return the line of an areas file for a contact area, without its end."""
+    return f"{recording},{area.value * 1e6:.5g},{area.uncertainty * 1e6:.2g}"
+
+
+HEADER = "recording,area_mm2,uncertainty_mm2"
+"""Of an areas file as ``add_area`` begins it."""
+
+
+def add_area(path: Path, recording: str, area: Quantity) -> None:
+    """Add a line to an areas file; a new one gets a header.
+
+    Raises
+    ------
+    FileError
+        The file has other columns, or cannot be written.
+    """
+    try:
+        before = path.read_text(encoding="utf-8-sig") if path.exists() else HEADER + "\n"
+        if before.partition("\n")[0].strip() != HEADER:
+            raise FileError(f"{path}: has other columns than {HEADER}. Remedy: another file, or add the line by hand")
+        end = "" if before.endswith("\n") else "\n"
+        path.write_text(f"{before}{end}{area_line(recording, area)}\n", encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise FileError(f"{path}: {error}. Remedy: name a file that can be written") from error

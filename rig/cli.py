@@ -14,6 +14,7 @@ COMMANDS = {
     "sweep": "predict a table of scenes",
     "load-sharing": "stress under the membrane and its sharing among the fibres",
     "analyze": "turn recordings into features, tables and reports",
+    "contact-area": "measure the contact on a still image",
     "recover": "repair a recording left by a crash",
     "accuracy": "error against run time of every solver",
     "figure": "draw a figure of the papers",

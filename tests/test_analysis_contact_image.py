@@ -59,7 +59,64 @@ def test_peel_zone_width() -> None:
     assert found.area.value == pytest.approx(np.pi * 0.5e-3**2, rel=0.02)
 
 
-@pytest.mark.parametrize("image", [np.full((50, 50), 7.0), np.zeros((4, 4, 4, 4))])
+def test_a_sharp_edge_is_no_peel_zone() -> None:
+    for noise in (0.0, 4.0, 12.0):
+        found = measure_contact(disk(0.45e-3, noise=noise), PIXEL, peel_zone=True)
+        assert found.peel_zone_width is None
+        assert any("no peel zone" in remark for remark in found.remarks)
+        assert found.area.value == pytest.approx(np.pi * 0.45e-3**2, rel=0.01)
+
+
+@pytest.mark.parametrize("light", ["plane", "corners", "shade"])
+@pytest.mark.parametrize("radius", [0.15e-3, 0.45e-3])
+def test_uneven_light_is_taken_off(light: str, radius: float) -> None:
+    y, x = np.mgrid[-1:1:600j, -1:1:600j]
+    even = disk(radius)
+    image = {"plane": even + 60 * (x + 0.3 * y), "corners": even - 50 * (x**2 + y**2), "shade": even * (1 - 0.3 * x)}
+    found = measure_contact(image[light], PIXEL)
+    assert found.area.value == pytest.approx(np.pi * radius**2, rel=0.02)
+    assert any("uneven light" in remark for remark in found.remarks)
+    assert not measure_contact(even, PIXEL).remarks
+
+
+def test_a_contact_at_the_border_is_remarked() -> None:
+    found = measure_contact(disk(0.45e-3)[:, 150:], PIXEL)
+    assert any("border" in remark for remark in found.remarks)
+
+
+def test_fibres_that_the_image_resolves_are_one_contact() -> None:
+    y, x = np.mgrid[:600, :600]
+    distance = np.hypot(x - 300, y - 300) * PIXEL
+    fibers = np.hypot(x % 25 - 12, y % 25 - 12) < 9
+    image = np.where((distance < 0.45e-3) & fibers, 60.0, 200.0)
+    found = measure_contact(image, PIXEL, fiber_spacing=25 * PIXEL)
+    assert found.area.value == pytest.approx(np.pi * 0.45e-3**2, rel=0.08)
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_scale_that_is_none_is_refused(scale: float) -> None:
+    with pytest.raises(AnalysisError, match="scale"):
+        measure_contact(disk(0.4e-3), scale)
+
+
+def test_an_image_with_holes_is_refused() -> None:
+    image = disk(0.4e-3)
+    image[3, 3] = np.nan
+    with pytest.raises(AnalysisError, match="no numbers"):
+        measure_contact(image, PIXEL)
+    with pytest.raises(AnalysisError, match="uncertainty"):
+        measure_contact(disk(0.4e-3), PIXEL, scale_uncertainty=-0.1)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.full((50, 50), 7.0),
+        np.zeros((4, 4, 4, 4)),
+        np.random.default_rng(0).normal(100, 5, (300, 300)),
+        np.linspace(0, 255, 300) + np.random.default_rng(0).normal(0, 5, (300, 300)),
+    ],
+)
 def test_images_without_contact_are_refused(image: Array) -> None:
     with pytest.raises(AnalysisError):
         measure_contact(image, PIXEL)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from analysis.synthetic import Profile, pull_off_run
 from rig.areas import read_areas, strangers, with_area
+from rig.cli import main
 from rig.errors import FileError
 
 
@@ -49,3 +51,36 @@ def test_what_is_no_area_is_refused_by_line(tmp_path: Path, text: str, words: st
         read_areas(written(tmp_path, text))
     with pytest.raises(FileError, match=r"nowhere\.csv"):
         read_areas(tmp_path / "nowhere.csv")
+
+
+def image(folder: Path) -> Path:
+    from skimage.io import imsave
+
+    y, x = np.mgrid[:400, :400]
+    shade = np.where(np.hypot(x - 200, y - 190) < 125, 60, 200) + 40 * (x - 200) / 200
+    path = folder / "left.png"
+    imsave(path, shade.astype(np.uint8), check_contrast=False)
+    return path
+
+
+def test_an_image_becomes_a_line_that_the_analysis_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture, areas = image(tmp_path), tmp_path / "areas.csv"
+    assert main(["contact-area", str(picture), "--scale", "4"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("recording,area_mm2,uncertainty_mm2\nleft,0.78")
+    assert "uneven light" in printed.err
+    for name in ("left", "right"):
+        assert main(["contact-area", str(picture), "--scale", "4", "--recording", name, "--add", str(areas)]) == 0
+    found = read_areas(areas)
+    assert list(found) == ["left", "right"]
+    assert found["left"]["contact_area_mm2"] == pytest.approx(np.pi * 0.5**2, rel=0.01)
+    assert 0.02 < found["left"]["contact_area_uncertainty_mm2"] / 0.785 < 0.03
+
+
+def test_what_is_no_image_is_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = tmp_path / "words.png"
+    words.write_text("no image", encoding="utf-8")
+    assert main(["contact-area", str(words), "--scale", "4"]) == 2
+    assert main(["contact-area", str(tmp_path / "none.png"), "--scale", "4"]) == 2
+    assert main(["contact-area", str(image(tmp_path)), "--scale", "-1"]) == 1
+    assert "Traceback" not in capsys.readouterr().err
