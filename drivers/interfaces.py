@@ -112,7 +112,10 @@ class Stage(Protocol):
         ...
 
     def move_to(self, position: float) -> None:
-        """Start or redirect a move; returns at once. ``OutOfRange`` if the target leaves ``travel``."""
+        """Start or redirect a move; returns at once.
+
+        ``OutOfRange`` if the target leaves ``travel``, unless the axis was polled further outside: it may come back.
+        """
         ...
 
     def stop(self) -> None:

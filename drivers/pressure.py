@@ -1,4 +1,4 @@
-"""Honeywell HSCSANN600MDAA5: +-600 mbar gauge, 10 to 90 % of its supply, ratiometric.
+"""Honeywell HSC....600MDAA5 (in any package): +-600 mbar gauge, 10 to 90 % of its supply, ratiometric.
 
     P = ((V / Vs - 0.1) / 0.8) * 1200 mbar - 600 mbar          (TruStability HSC series, transfer function A)
 
@@ -55,6 +55,8 @@ class HoneywellHSC:
         A live sensor's own noise is larger than that of the converter alone: measure both on the rig.
     zero
         What the sensor reads with port 1 open to the room, Pa; it is subtracted.
+    slope, intercept
+        Of a calibration against a standard: true Pa = slope * (P - zero) + intercept.
     """
 
     def __init__(
@@ -65,13 +67,16 @@ class HoneywellHSC:
         averaging: float = 0.1,
         quietest: float | None = 2e-4,
         zero: float = 0.0,
+        slope: float = 1.0,
+        intercept: float = 0.0,
     ) -> None:
         window = round(averaging * rate) if averaging >= 0.05 and rate > 0 else 0
         if window < 1:
             raise ValueError(f"{name}: averaging {averaging} s at {rate} Hz; it must be at least 0.05 s and one sample")
         self.name = name
         self._quietest = quietest
-        self._middle = _MIDDLE + zero
+        self._slope = slope * _SLOPE
+        self._middle = slope * (_MIDDLE + zero) - intercept
         self._window = window
         self._supply = _RunningMean(window)
         self._past_signal = np.empty(0)
@@ -102,7 +107,7 @@ class HoneywellHSC:
         return past
 
     def _pressure(self, signal: Array, supply: Array) -> Array:
-        pressure: Array = signal / supply * _SLOPE - self._middle
+        pressure: Array = signal / supply * self._slope - self._middle
         return pressure
 
     def _convert_doubtful(self, signal: Array, supply: Array, mean: Array, past: Array) -> Reading:

@@ -134,6 +134,7 @@ class PIStage:
         try:
             self._identity = self._identify(expected_model)
             self._travel = self._find_travel(minimum, maximum)
+            self._position = self._travel[0]
             self._find_state()
         except BaseException:
             self.close()
@@ -196,6 +197,7 @@ class PIStage:
             word = self._status_word()
             position = self._direction * self._value(self._gcs.qPOS())
             received = self._clock()
+            self._position = position
             error = self._gcs.qERR() if word & ERROR else NO_ERROR
             limits = (word & LIMITS) ^ self._limits_idle
             self._check_health(word, limits, error)
@@ -219,12 +221,12 @@ class PIStage:
             self._gcs.VEL(self._axis, speed * 1e3)
 
     def move_to(self, position: float) -> None:
-        """Start or redirect a move to ``position`` (m, within ``travel``).
+        """Start or redirect a move to ``position`` (m, within ``travel``, or on the way back to it).
 
         After an emergency stop every move is refused until ``stop`` has acknowledged it.
         """
         low, high = self._travel
-        if not low <= position <= high:
+        if not min(low, self._position) <= position <= max(high, self._position):
             raise OutOfRange(
                 DEVICE,
                 f"target {position * 1e3:.6g} mm lies outside the travel {low * 1e3:.6g} .. {high * 1e3:.6g} mm",

@@ -25,10 +25,10 @@ class StageSection(Section):
     ``left_on`` is for an emulated one: it has kept its reference and stands at ``start_mm`` (a real one is asked).
     """
 
-    connection: str
-    model: str = "C-863"
+    connection: Title
+    model: Title = "C-863"
     baud: Annotated[int, Field(ge=1200, le=921600)] = 115200
-    axis: str = "1"
+    axis: Title = "1"
     inverted: bool = False
     minimum_mm: float
     maximum_mm: float
@@ -41,6 +41,11 @@ class StageSection(Section):
     def _has_travel(self) -> StageSection:
         if self.minimum_mm >= self.maximum_mm:
             raise ValueError(f"minimum_mm = {self.minimum_mm:g} must lie below maximum_mm = {self.maximum_mm:g}")
+        if self.start_mm is not None and not self.minimum_mm <= self.start_mm <= self.maximum_mm:
+            raise ValueError(
+                f"start_mm = {self.start_mm:g} must lie within minimum_mm = {self.minimum_mm:g} and "
+                f"maximum_mm = {self.maximum_mm:g}"
+            )
         return self
 
     @model_validator(mode="after")
@@ -56,8 +61,8 @@ class PumpSection(Section):
     ``volume_uncertainty_percent`` is that of a volume it moves: the syringe's diameter and the mechanism together.
     """
 
-    connection: str
-    model: str = "Legato"
+    connection: Title
+    model: Title = "Legato"
     baud: Annotated[int, Field(ge=1200, le=921600)] = 115200
     address: Annotated[int, Field(ge=0, le=99)] = 0
     syringe_diameter_mm: Annotated[float, Field(gt=0, le=50)]
@@ -71,8 +76,8 @@ class PumpSection(Section):
 class DaqSection(Section):
     """``[daq]``: NI device, through the local runtime or a gRPC server."""
 
-    connection: str = "local"
-    model: str | None = None
+    connection: Title = "local"
+    model: Title | None = None
     rate_Hz: Annotated[float, Field(ge=100, le=50_000)] = 1000.0
     frame_ms: Annotated[float, Field(ge=1, le=1000)] = 20.0
     allow_remote: bool = False
@@ -81,15 +86,20 @@ class DaqSection(Section):
         """Return how many samples a frame holds at the device's real ``rate``, Hz."""
         return max(1, round(self.frame_ms * 1e-3 * rate))
 
+    @property
+    def frame_s(self) -> float:
+        """How long a frame is, s: ``frame_ms`` in whole samples."""
+        return self.frame_samples(self.rate_Hz) / self.rate_Hz
+
 
 class CalibrationSection(Section):
     """A calibration record: one line, value = slope * reading + intercept, and where it comes from."""
 
-    id: str
-    certificate: str
+    id: Title
+    certificate: Title
     date: date
-    operator: str
-    serial: str
+    operator: Title
+    serial: Title
     slope: Annotated[float, Field(gt=0)]
     intercept: float = 0.0
     relative_uncertainty: Annotated[float, Field(gt=0, le=1)]
@@ -104,8 +114,8 @@ class ForceSection(Section):
     of zero says that it was never measured.
     """
 
-    channel: str
-    cell: str = "GSO-500"
+    channel: Title
+    cell: Title = "GSO-500"
     capacity_N: Annotated[float, Field(gt=0, le=1000)]
     readout: Literal["amplified", "bridge"] = "amplified"
     range_V: Annotated[float, Field(gt=0, le=20)] = 10.0
@@ -132,15 +142,31 @@ class ZeroSection(Section):
     temperature_C: float | None = None
 
 
-class PressureSection(Section):
-    """``[pressure]``: Honeywell HSC, ratiometric, its supply on a channel of its own."""
+class PressureCalibrationSection(CalibrationSection):
+    """``[pressure.calibration]``: true Pa = slope * (data sheet's Pa less the zero) + intercept, against a standard."""
 
-    signal_channel: str
-    supply_channel: str
-    sensor: str = "HSCSANN600MDAA5"
+    slope: Annotated[float, Field(ge=0.9, le=1.1)]
+    intercept: Annotated[float, Field(ge=-1200, le=1200)] = 0.0
+
+
+class PressureSection(Section):
+    """``[pressure]``: Honeywell HSC of +-600 mbar in any package, ratiometric, its supply on a channel of its own."""
+
+    signal_channel: Title
+    supply_channel: Title
+    sensor: Annotated[str, Field(pattern=r"^HSC[A-Z]{4}600MDAA5$")] = "HSCSANN600MDAA5"
     terminal: Literal["default", "rse", "diff"] = "default"
     zero: ZeroSection | None = None
-    calibration: CalibrationSection | None = None
+    calibration: PressureCalibrationSection | None = None
+
+    @model_validator(mode="after")
+    def _has_one_zero(self) -> PressureSection:
+        if self.zero is not None and self.calibration is not None and self.calibration.intercept:
+            raise ValueError(
+                f"zero.offset_Pa and calibration.intercept = {self.calibration.intercept:g} both say where zero is; "
+                "remove the table [pressure.zero], or set the intercept to 0"
+            )
+        return self
 
 
 class LimitsSection(Section):
@@ -150,7 +176,7 @@ class LimitsSection(Section):
     tension_N: Annotated[float, Field(gt=0)]
     pressure_low_kPa: Annotated[float, Field(ge=-101.3, le=0)] = -55.0
     pressure_high_kPa: Annotated[float, Field(ge=0, le=1000)] = 55.0
-    look_ahead_um: Annotated[float, Field(gt=0, le=1000)] = 50.0
+    look_ahead_um: Annotated[float, Field(gt=0, le=1000)] = 40.0
     lag_s: Annotated[float, Field(gt=0, le=60)] = 0.5
 
 
@@ -182,6 +208,18 @@ class Bench(Section):
                     f"limits.{key} = {limit:g} is beyond the load cell: {self.force.cell} carries "
                     f"{self.force.capacity_N:g} N, at most {100 * OVERLOAD:g} % of it ({most:.3g} N) is allowed"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _is_emulated_as_a_whole(self) -> Bench:
+        parts = {"stage": self.stage, "daq": self.daq, "pump": self.pump}
+        emulated = {name: part.connection == EMULATED for name, part in parts.items() if part is not None}
+        if len(set(emulated.values())) > 1:
+            names = {kind: ", ".join(n for n, e in emulated.items() if e is kind) for kind in (True, False)}
+            raise ValueError(
+                f'connection = "{EMULATED}" of {names[True]}, but not of {names[False]}: the emulated ones share one '
+                "world; emulate all or none"
+            )
         return self
 
     @model_validator(mode="after")

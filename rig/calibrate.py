@@ -190,7 +190,7 @@ def _tared(recording: Recording, start: int, stop: int) -> Array:
 
 
 def pressure_zero(recording: Recording) -> Calibration:
-    """Average the reading with the port open; the zero the bench file has already is added back."""
+    """Average the data sheet's reading with the port open: what the bench file corrects already is taken back."""
     from analysis.calibration import pressure_zero as average
     from analysis.numerics import running_mean
     from drivers.pressure import TOTAL_ERROR_BAND
@@ -198,9 +198,10 @@ def pressure_zero(recording: Recording) -> Calibration:
     step = next((s for s in recording.step_table() if s.name == "zero" and s.outcome == "done"), None)
     if step is None or recording.pressure is None or recording.bench.pressure is None:
         raise _too_short(recording, "the recording does not hold the whole rest at zero pressure")
-    zero = recording.bench.pressure.zero
+    zero, line = recording.bench.pressure.zero, recording.bench.pressure.calibration
     present = 0.0 if zero is None else zero.offset_Pa
-    pressure = recording.pressure[step.start : step.stop] + present
+    slope, intercept = (1.0, 0.0) if line is None else (line.slope, line.intercept)
+    pressure = (recording.pressure[step.start : step.stop] - intercept) / slope + present
     offset, uncertainty = average(pressure, recording.rate)
     if abs(offset) > TOTAL_ERROR_BAND:
         raise FileError(

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from rig.errors import FileError
 from rig.library import find, load_scene
-from rig.scene import Scene, Section, Title, parse_scene
+from rig.scene import PRINTABLE, Scene, Section, Title, parse_scene
 from rig.validation import parsed
 
 JOURNAL = "journal.jsonl"
@@ -33,17 +33,17 @@ class EntrySection(Section):
     ``name`` (by default the scene's) names recordings and titles of tests at other pressures than the scene's.
     """
 
-    scene: str
+    scene: Annotated[str, Field(pattern=PRINTABLE)]
     name: Title | None = None
     initial_pressures_kPa: Annotated[tuple[float, ...], Field(min_length=1, strict=False)] | None = None
     repeats: Annotated[int, Field(ge=1, le=MOST_REPEATS)] | None = None
-    prompt: str = ""
+    prompt: Annotated[str, Field(max_length=1000, pattern=PRINTABLE)] = ""
 
 
 class Campaign(Section):
     """A campaign file."""
 
-    title: str
+    title: Title
     order: Literal["given", "random"] = "given"
     seed: int = 0
     repeats: Annotated[int, Field(ge=1, le=MOST_REPEATS)] = 1

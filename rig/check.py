@@ -15,9 +15,14 @@ from rig.scene import (
     Scene,
     VolumeSection,
 )
+from sequences.reference import Parking
+from sequences.step import steady_speed
 
 STOPPING_MARGIN = 1.5
 """Room for the frame that is under way when a limit is passed."""
+
+PARK_SPEED = 500e-6
+"""m/s."""
 
 RESOLUTION = 10.0
 """A preload is worth setting if it is so many times what the load cell is known to."""
@@ -25,8 +30,16 @@ RESOLUTION = 10.0
 REACTION_S = 0.05
 """From the end of a frame to the stop byte at the stage: 99 of 100 measured were faster (docs/reliability.md)."""
 
-SLOW_UM_S = 20.0
-"""Slow enough to press a rigid stop with a load train whose compliance nobody knows yet."""
+STIFFEST_UM_PER_N = 10.0
+"""What a load train is taken to give at least while nobody has measured it: stiffer than a cell that bends, its bracket
+and the stage should be (100 N/mm; the emulated one gives 12 um/N). Whoever knows better enters it in the bench.
+"""
+
+TOUCH = 0.1
+"""Change of force that ends the way to the starting height, in capacities: nothing should be in that way."""
+
+TARE_FRAMES = 4
+"""Frames a tare needs at least, or it could not tell noise and drift."""
 
 
 def check(scene: Scene, bench: Bench) -> None:
@@ -44,7 +57,7 @@ def check(scene: Scene, bench: Bench) -> None:
 
 def reasons(scene: Scene, bench: Bench) -> list[str]:
     """Return why the bench cannot carry out the scene, each with value, limit and remedy; empty if it can."""
-    parts = (_instruments, _forces, _resolution, _tension, _pressure, _strokes, _speeds, _overruns)
+    parts = (_instruments, _forces, _resolution, _tension, _pressure, _strokes, _tare, _speeds, _overruns, _retraction)
     return [reason for part in parts for reason in part(scene, bench)]
 
 
@@ -164,13 +177,24 @@ def _pressure(scene: Scene, bench: Bench) -> list[str]:
     return found
 
 
+def _tare(scene: Scene, bench: Bench) -> list[str]:
+    least = TARE_FRAMES * bench.daq.frame_s
+    protocol = scene.protocol
+    if not isinstance(protocol, ContactSection) or protocol.tare_s >= least:
+        return []
+    return [
+        f"tare_s = {protocol.tare_s:g} is less than {TARE_FRAMES} frames of {bench.daq.frame_s * 1e3:g} ms; make it at "
+        f"least {least:g} s or shorten frame_ms"
+    ]
+
+
 def _speeds(scene: Scene, bench: Bench) -> list[str]:
     """The look-ahead must outlast several frames, or the stage would stutter."""
-    fastest = bench.limits.look_ahead_um / 4 / (bench.daq.frame_ms * 1e-3)
+    fastest = steady_speed(bench.limits.look_ahead_um, bench.daq.frame_s)
     keys = ("approach_speed_um_s", "retract_speed_um_s")
     return [
         f"{key} = {speed:g} is too fast for a look-ahead of {bench.limits.look_ahead_um:g} um in frames of "
-        f"{bench.daq.frame_ms:g} ms (at most {fastest:g} um/s); lower it, shorten frame_ms or lengthen look_ahead_um"
+        f"{bench.daq.frame_s * 1e3:g} ms (at most {fastest:g} um/s); lower it, shorten frame_ms or raise look_ahead_um"
         for key in keys
         if (speed := getattr(scene.protocol, key, 0.0)) > fastest
     ]
@@ -182,34 +206,74 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
     A limit that is passed stops it a frame and the reaction later; data that come late, as late as the bench allows,
     stop it so much after the preload; and if this program dies just before the preload, it goes on for the look-ahead.
     """
-    speed = getattr(scene.protocol, "approach_speed_um_s", None)
-    if speed is None:
+    protocol = scene.protocol
+    if not isinstance(protocol, ContactSection):
         return []
-    compliance, overload = bench.force.compliance_um_per_N, OVERLOAD * bench.force.capacity_N
-    if compliance == 0.0 and isinstance(scene.protocol, ComplianceSection) and speed <= SLOW_UM_S:
-        return []  # this is how it becomes known
-    if compliance == 0.0:
+    if bench.force.compliance_um_per_N == 0.0 and not isinstance(protocol, ComplianceSection):
         return [
             "force.compliance_um_per_N of the bench is 0: nobody knows how fast the force rises on contact; "
-            f"run the scene `compliance` at {SLOW_UM_S:g} um/s or less and enter its result"
+            "run the scene `compliance` and enter its result"
         ]
-    preload = getattr(scene.protocol, "preload_N", 0.0)
-    reaction = bench.daq.frame_ms * 1e-3 + REACTION_S
-    late = reaction + bench.limits.lag_s
-    fastest = {
-        "lower compression_N or shorten frame_ms": (overload - bench.limits.compression_N) * compliance / reaction,
-        "lower preload_N or shorten lag_s": (overload - preload) * compliance / late,
-    }
-    found = [
-        f"approach_speed_um_s = {speed:g} can overload the load cell, whose force rises by 1 N in {compliance:g} um "
-        f"(at most {most:.3g} um/s); approach more slowly, {remedy}"
+    limits, preload = bench.limits, protocol.preload_N
+    reaction = bench.daq.frame_s + REACTION_S
+    found = _too_fast(
+        "approach_speed_um_s",
+        protocol.approach_speed_um_s,
+        bench,
+        {
+            "lower compression_N or shorten frame_ms": _room(bench, limits.compression_N) / reaction,
+            "lower preload_N or shorten lag_s": _room(bench, preload) / (reaction + limits.lag_s),
+        },
+    )
+    furthest = _room(bench, preload)
+    if limits.look_ahead_um > furthest:
+        found.append(
+            f"look_ahead_um = {limits.look_ahead_um:g} would overload the load cell if this computer died at the "
+            f"preload ({_stiffness(bench)}; at most {furthest:.3g} um); shorten it"
+        )
+    return found
+
+
+def _retraction(scene: Scene, bench: Bench) -> list[str]:
+    """The tension limit must stop the stage in time, even if the specimen were bonded rigidly."""
+    protocol = scene.protocol
+    if not isinstance(protocol, ContactSection):
+        return []
+    most = _room(bench, bench.limits.tension_N) / (bench.daq.frame_s + REACTION_S)
+    remedies = {"lower tension_N or shorten frame_ms": most}
+    return _too_fast("retract_speed_um_s", protocol.retract_speed_um_s, bench, remedies)
+
+
+def _too_fast(key: str, speed: float, bench: Bench, fastest: dict[str, float]) -> list[str]:
+    """Return a reason for every speed (um/s) that is passed; its remedy names it."""
+    return [
+        f"{key} = {speed:g} can overload the load cell ({_stiffness(bench)}; at most {most:.3g} um/s); make it slower, "
+        f"{remedy}"
         for remedy, most in fastest.items()
         if speed > most
     ]
-    furthest = (overload - preload) * compliance
-    if bench.limits.look_ahead_um > furthest:
-        found.append(
-            f"look_ahead_um = {bench.limits.look_ahead_um:g} would overload the load cell if this computer died at the "
-            f"preload (at most {furthest:.3g} um); shorten it"
-        )
-    return found
+
+
+def _stiffness(bench: Bench) -> str:
+    known = bench.force.compliance_um_per_N
+    words = f"1 N in {known or STIFFEST_UM_PER_N:g} um"
+    return f"its force changes by {words}" if known else f"its compliance is unknown, {words} is assumed"
+
+
+def _room(bench: Bench, force: float) -> float:
+    """Return how far the stage may go on from this force (N) against something rigid, um."""
+    compliance = bench.force.compliance_um_per_N or STIFFEST_UM_PER_N
+    return (OVERLOAD * bench.force.capacity_N - force) * compliance
+
+
+def parking(bench: Bench) -> Parking:
+    """Return how the stage is brought to its starting height, so that it harms nothing that is in its way."""
+    touch = TOUCH * bench.force.capacity_N
+    room = _room(bench, touch) * 1e-6
+    start = bench.stage.start_mm
+    return Parking(
+        start=None if start is None else start * 1e-3,
+        speed=min(PARK_SPEED, room / (bench.daq.frame_s + REACTION_S)),
+        look_ahead=room,
+        touch=touch,
+    )

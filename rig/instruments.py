@@ -256,8 +256,16 @@ def sensor_converter(bench: Bench, pressure: bool, rate: float) -> SensorConvert
 def _pressure_sensor(bench: Bench, rate: float) -> HoneywellHSC:
     from drivers.pressure import HoneywellHSC
 
-    zero = bench.pressure.zero if bench.pressure is not None else None
-    return HoneywellHSC(rate=rate, zero=0.0 if zero is None else zero.offset_Pa)
+    part = bench.pressure
+    if part is None:
+        raise ValueError("the bench has no pressure sensor; check() refuses such a scene")
+    calibration = part.calibration
+    return HoneywellHSC(
+        rate=rate,
+        zero=0.0 if part.zero is None else part.zero.offset_Pa,
+        slope=1.0 if calibration is None else calibration.slope,
+        intercept=0.0 if calibration is None else calibration.intercept,
+    )
 
 
 def _connection(device: str, named: str, connections: dict[str, str] | None) -> str:

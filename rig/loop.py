@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -180,7 +180,7 @@ class Loop:
         self._pump_frames = pump_frames
         self._stage_status: StageStatus
         self._pump_status: PumpStatus | None = None
-        self._holding = False
+        self._holding = self._resumed = False
         self.samples = 0
         self.interlock_latency: float | None = None
         self.checks = Latencies()
@@ -205,7 +205,8 @@ class Loop:
                 self._reporter.notify("frame", frame)
                 self._obey(self._controls.take())
                 if not self._holding:
-                    sequence.send(frame)
+                    sequence.send(replace(frame, resumed=True) if self._resumed else frame)
+                    self._resumed = False
                     self._holding = self._reporter.take_question()
         except StopIteration:
             return
@@ -298,6 +299,6 @@ class Loop:
             if self._instruments.pump is not None:
                 self._instruments.pump.stop()
         elif wish is Wish.RESUME:
-            self._holding = False
+            self._resumed, self._holding = self._holding, False
         elif wish in (Wish.STOP, Wish.EMERGENCY):
             raise StoppedByOperator(f"{wish.value} by the operator in step {self._reporter.step}")

@@ -12,7 +12,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
 from rig.validation import parsed
 
-Title = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
+PRINTABLE = r"^[^\x00-\x1f\x7f-\x9f]*$"
+"""Control characters would act on the terminal that shows the text."""
+
+Title = Annotated[str, Field(max_length=200, pattern=PRINTABLE)]
+
+
+FINEST_ML = 1e-5
+"""The smallest stroke that is worth moving; the pump itself takes a tenth of it."""
 
 
 class Section(BaseModel):
@@ -103,7 +110,7 @@ class IndentationSection(ContactSection):
     indenter_radius_uncertainty_mm: Annotated[float, Field(ge=0, le=1000)] = 0.02
     contact_area_mm2: Annotated[float, Field(gt=0)] | None = None
     contact_area_uncertainty_mm2: Annotated[float, Field(ge=0)] | None = None
-    positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
+    positions: Annotated[tuple[Title, ...], Field(min_length=1, strict=False)] = (
         "top",
         "center",
         "bottom",
@@ -126,7 +133,7 @@ class FiberSection(ContactSection):
     real_area_uncertainty_um2: Annotated[float, Field(ge=0)] | None = None
     projected_area_um2: Annotated[float, Field(gt=0)] | None = None
     projected_area_uncertainty_um2: Annotated[float, Field(ge=0)] | None = None
-    positions: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = ("SPL#1", "SPL#2", "SPL#3")
+    positions: Annotated[tuple[Title, ...], Field(min_length=1, strict=False)] = ("SPL#1", "SPL#2", "SPL#3")
     repeats: Annotated[int, Field(ge=1, le=1000)] = 5
 
 
@@ -144,6 +151,15 @@ class VolumeSection(Section):
     name: Literal["volume"]
     strokes_ml: Annotated[tuple[float, ...], Field(min_length=2, strict=False)] = (-0.1, -0.1, 0.2, 0.1, -0.1)
     settle_s: Annotated[float, Field(ge=0.5, le=3600)] = 3.0
+
+    @model_validator(mode="after")
+    def _every_stroke_moves(self) -> VolumeSection:
+        if any(abs(stroke) < FINEST_ML for stroke in self.strokes_ml):
+            raise ValueError(
+                f"strokes_ml = {list(self.strokes_ml)}: every stroke must move at least {FINEST_ML:g} ml; leave out "
+                "those that do not"
+            )
+        return self
 
 
 class LeakSection(Section):
@@ -169,7 +185,13 @@ class DeadWeightsSection(Section):
     """``[protocol]`` of the load cell calibration: masses hung one after the other, up and down."""
 
     name: Literal["dead_weights"]
-    masses_g: Annotated[tuple[float, ...], Field(min_length=2, strict=False)] = (0.0, 20.0, 50.0, 100.0, 200.0)
+    masses_g: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=2, strict=False)] = (
+        0.0,
+        20.0,
+        50.0,
+        100.0,
+        200.0,
+    )
     mass_tolerance_percent: Annotated[float, Field(ge=0, le=10)] = 0.05
     gravity_m_s2: Annotated[float, Field(ge=9.7, le=9.9)] = 9.80665
     rest_s: Annotated[float, Field(ge=0.5, le=600)] = 2.0

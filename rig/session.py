@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.errors import DeviceError
 from rig.bench import Bench
-from rig.check import check
+from rig.check import check, parking
 from rig.commanded import CommandedPump, CommandedStage
 from rig.errors import FileError, Interlock, Refused, RigError
 from rig.instruments import Opened, open_instruments
@@ -241,8 +241,7 @@ def reference_stage(request: Request, opened: Opened) -> None:
     reporter = Reporter(opened.observers)
     apparatus = Apparatus(opened.stage, None, reporter, request.bench.limits.look_ahead_um * 1e-6)
     instruments = Instruments(opened.stage, None, opened.daq, opened.clock)
-    start = request.bench.stage.start_mm
-    steps = reference(apparatus, None if start is None else start * 1e-3)
+    steps = reference(apparatus, parking(request.bench))
     try:
         _loop(request, opened, instruments, reporter, None).run(play(steps, reporter))
     finally:

@@ -45,7 +45,7 @@ def validated(schema: type[Schema], kind: str, content: dict[str, Any], source: 
     try:
         return schema.model_validate(content)
     except ValidationError as error:
-        lines = [_line(finding, schema) for finding in error.errors(include_url=False)]
+        lines = [_line(finding, schema, content) for finding in error.errors(include_url=False)]
         raise FileError(_printable(f"{kind} {source}: " + "; ".join(dict.fromkeys(lines)))) from error
 
 
@@ -54,8 +54,8 @@ def _printable(text: str) -> str:
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
-def _line(finding: Any, schema: type[BaseModel]) -> str:
-    key = ".".join(str(part) for part in finding["loc"])
+def _line(finding: Any, schema: type[BaseModel], content: dict[str, Any]) -> str:
+    key = ".".join(_place(finding["loc"], content))
     if finding["type"] == "extra_forbidden":
         known = sorted(_keys(schema))
         close = difflib.get_close_matches(str(finding["loc"][-1]), known, n=1, cutoff=0.5)
@@ -67,6 +67,16 @@ def _line(finding: Any, schema: type[BaseModel]) -> str:
     if finding["type"] == "value_error":
         return f"{key + ': ' if key else ''}{reason}"
     return f"{key} = {finding['input']!r} is not allowed; it should be {reason}"
+
+
+def _place(location: tuple[str | int, ...], content: Any) -> Iterable[str]:
+    """Yield the keys as they stand in the file: the tag of a table that has several forms is none of them."""
+    for number, part in enumerate(location):
+        inside = isinstance(content, dict) and part in content
+        if isinstance(content, dict) and not inside and number + 1 < len(location):
+            continue
+        yield str(part)
+        content = content[part] if inside or (isinstance(content, list) and isinstance(part, int)) else None
 
 
 def _keys(schema: type[BaseModel]) -> Iterable[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sequences.frame import Frame
-from sequences.step import Apparatus, Motion, Step, Steps, by_hand, rest
+from sequences.step import Apparatus, Step, Steps, by_hand, rest, travel
 
 WEIGH = "weigh"
 """First word of the steps in which a known mass hangs still."""
@@ -48,14 +48,6 @@ def unload(apparatus: Apparatus, speed: float, distance: float) -> Step:
 
     def act(frame: Frame) -> Steps:
         target = min(frame.stage.position + distance, apparatus.stage.travel[1])
-        motion = Motion(apparatus, target, speed)
-        try:
-            while not motion.arrived(frame):
-                motion.extend(frame)
-                frame = yield
-                apparatus.tell.progress(frame.stage.position, target, "m")
-        finally:
-            apparatus.stage.stop()
-        return frame
+        return travel(apparatus, target, speed, "unload", frame)
 
     return Step("unload", f"{distance * 1e6:g} um further up, clear of the stop", act)

@@ -34,6 +34,8 @@ class Frame:
         The poll made right after the samples arrived.
     pump
         The poll made with it, or ``None``; may be older than the frame (``pump.received`` tells).
+    resumed
+        The first frame after a hold, which has stopped stage and pump; those of the hold reach no step.
     """
 
     number: int
@@ -44,6 +46,7 @@ class Frame:
     pressure: Array | None
     stage: StageStatus
     pump: PumpStatus | None = None
+    resumed: bool = False
 
     @property
     def stop(self) -> int:

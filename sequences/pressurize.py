@@ -17,6 +17,9 @@ SETTLE, MEAN, STROKE = 1.0, 0.5, 4.0
 
 MOST_STROKES = 12
 
+FINEST = 2e-12
+"""m^3; what is less the pump cannot be told."""
+
 
 @dataclass(frozen=True, slots=True)
 class Chamber:
@@ -43,17 +46,14 @@ class Pressurizer:
         """Bring the chamber to ``goal`` (Pa gauge)."""
         self._goal = goal
         pressure = np.nan
-        try:
-            for _ in range(MOST_STROKES):
-                frame = yield from self._settle(frame)
-                pressure, frame = yield from self.mean_pressure(frame)
-                if abs(pressure - goal) <= 0.6 * self._tolerance:
-                    self._apparatus.tell.note(f"P_0 reached: {pressure / 1e3:+.3f} kPa")
-                    return frame
-                after = self._chamber.atmospheric_pressure + goal
-                frame = yield from self.dispense(self._chamber.volume * (goal - pressure) / after, frame)
-        finally:
-            self._pump.stop()
+        for _ in range(MOST_STROKES):
+            frame = yield from self._settle(frame)
+            pressure, frame = yield from self.mean_pressure(frame)
+            if abs(pressure - goal) <= 0.6 * self._tolerance:
+                self._apparatus.tell.note(f"P_0 reached: {pressure / 1e3:+.3f} kPa")
+                return frame
+            after = self._chamber.atmospheric_pressure + goal
+            frame = yield from self.dispense(self._chamber.volume * (goal - pressure) / after, frame)
         raise StepFailed(
             self._step,
             f"P_a stays at {pressure / 1e3:+.3f} kPa, {goal / 1e3:+g} kPa wanted",
@@ -61,16 +61,33 @@ class Pressurizer:
         )
 
     def dispense(self, volume: float, frame: Frame) -> Steps:
-        """Move the pump by so much (m^3, positive into the chamber) and wait until it has done so."""
+        """Move the pump by so much (m^3, positive into the chamber) and wait until it has done so.
+
+        A hold stops the pump; what it has not moved by then is moved afterwards.
+        """
+        goal = _moved(frame) + volume
+        try:
+            while abs(volume) >= FINEST:
+                frame, held = yield from self._stroke(volume, frame)
+                volume = goal - _moved(frame) if held else 0.0
+        finally:
+            self._pump.stop()
+        return frame
+
+    def _stroke(self, volume: float, frame: Frame) -> Generator[None, Frame, tuple[Frame, bool]]:
+        """Let the pump move once; return the last frame and whether a hold has stopped it."""
         slowest, fastest = self._pump.rate_limits
         rate = min(max(abs(volume) / STROKE, 2 * slowest), 0.9 * fastest)
-        before = frame.pump
+        before, held = frame.pump, False
         self._pump.dispense(volume, rate)
-        deadline = frame.stop + int((3 * abs(volume) / rate + 5) * frame.rate)
+        left = (3 * abs(volume) / rate + 5) * frame.rate
         while frame.pump is before or frame.pump is None or frame.pump.state in _RUNNING:
             frame = yield
             self._show(frame)
-            if frame.stop > deadline:
+            left -= frame.force.size
+            if frame.resumed:
+                before, held = frame.pump, True  # that poll may be older than the stop
+            if left < 0:
                 raise StepFailed(self._step, "the pump did not reach its target volume", "look at the pump's screen")
         if frame.pump.state in (PumpState.STALLED, PumpState.AT_LIMIT):
             raise StepFailed(
@@ -78,23 +95,25 @@ class Pressurizer:
                 f"the pump is {frame.pump.state} after {frame.pump.volume * 1e6:.4f} ml",
                 "free the syringe, check its travel and the force setting, then run again",
             )
-        return frame
+        return frame, held
 
     def mean_pressure(self, frame: Frame) -> Generator[None, Frame, tuple[float, Frame]]:
         """Return the mean over half a second, Pa, and the last frame."""
         means: list[float] = []
-        begin = frame.stop
-        while frame.stop - begin < MEAN * frame.rate:
+        left = MEAN * frame.rate
+        while left > 0:
             frame = yield
+            left -= frame.force.size
             if frame.pressure is not None:
                 means.append(float(frame.pressure.mean()))
             self._show(frame)
         return float(np.mean(means)), frame
 
     def _settle(self, frame: Frame) -> Steps:
-        begin = frame.stop
-        while frame.stop - begin < SETTLE * frame.rate:
+        left = SETTLE * frame.rate
+        while left > 0:
             frame = yield
+            left -= frame.force.size
             self._show(frame)
         return frame
 
@@ -104,3 +123,8 @@ class Pressurizer:
 
 
 _RUNNING = (PumpState.INFUSING, PumpState.WITHDRAWING)
+
+
+def _moved(frame: Frame) -> float:
+    """Return what the pump has moved so far, m^3."""
+    return 0.0 if frame.pump is None else frame.pump.volume

@@ -13,7 +13,7 @@ import numpy as np
 from sequences.errors import StepFailed
 from sequences.frame import Frame
 from sequences.pressurize import Chamber, Pressurizer
-from sequences.step import Apparatus, Motion, Step, Steps, rest, stopping_on_failure
+from sequences.step import Apparatus, Motion, Step, Steps, rest, stopping_on_failure, travel
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +76,12 @@ class PullOff:
     def _tare(self, frame: Frame) -> Steps:
         self._start_height = frame.stage.position
         blocks: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
-        begin = frame.stop
-        while frame.stop - begin < self._settings.tare * frame.rate:
+        samples = 0
+        while samples < self._settings.tare * frame.rate:
             frame = yield
             blocks.append(frame.force)
-            self._apparatus.tell.progress((frame.stop - begin) / frame.rate, self._settings.tare, "s")
+            samples += frame.force.size
+            self._apparatus.tell.progress(samples / frame.rate, self._settings.tare, "s")
         force = np.concatenate(blocks)
         means = np.array([block.mean() for block in blocks])
         self._zero, self._noise = float(force.mean()), float(means.std(ddof=1))
@@ -216,16 +217,4 @@ class PullOff:
     def _return(self, frame: Frame) -> Steps:
         """Go up to the starting height."""
         target = max(self._start_height, frame.stage.position)
-        motion = Motion(self._apparatus, target, self._settings.return_speed)
-        seconds = 3 * (target - frame.stage.position) / self._settings.return_speed + 5
-        deadline = frame.stop + round(seconds * frame.rate)
-        try:
-            while not motion.arrived(frame):
-                motion.extend(frame)
-                frame = yield
-                self._apparatus.tell.progress(frame.stage.position, target, "m")
-                if frame.stop > deadline:
-                    raise StepFailed("return", "the stage does not arrive", "check the path and the stage's servo")
-        finally:
-            self._apparatus.stage.stop()
-        return frame
+        return travel(self._apparatus, target, self._settings.return_speed, "return", frame)

@@ -2,42 +2,83 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 from sequences.errors import StepFailed
 from sequences.frame import Frame
-from sequences.step import Apparatus, Motion, Step, Steps, stopping_on_failure
+from sequences.step import Apparatus, Step, Steps, stopping_on_failure, travel
 
-PARK_SPEED = 500e-6
 LONGEST_SECONDS = 120.0
 
 
-def reference(apparatus: Apparatus, start: float | None = None) -> list[Step]:
-    """Return the steps that reference the axis and park it at ``start`` (m), or at the highest allowed position."""
+@dataclass(frozen=True, slots=True)
+class Parking:
+    """How the stage is brought to where a test begins: the way there touches nothing, or is given up.
+
+    Attributes
+    ----------
+    start
+        Height, m; ``None`` is the highest allowed.
+    speed
+        m/s, at most.
+    look_ahead
+        m, at most.
+    touch
+        Change of force that is taken for a touch, N.
+    """
+
+    start: float | None
+    speed: float
+    look_ahead: float
+    touch: float
+
+
+def reference(apparatus: Apparatus, parking: Parking) -> list[Step]:
+    """Return the steps that reference the axis and park it.
+
+    Raises
+    ------
+    StepFailed
+        The stage cannot be parked there.
+    """
+    low, high = apparatus.stage.travel
+    start = high if parking.start is None else parking.start
+    if not low <= start <= high:
+        raise StepFailed(
+            "park",
+            f"start_mm = {start * 1e3:g} lies outside the stage's travel of {low * 1e3:g} to {high * 1e3:g} mm",
+            "correct start_mm in the bench file",
+        )
+    careful = replace(apparatus, look_ahead=min(apparatus.look_ahead, parking.look_ahead))
 
     def seek(frame: Frame) -> Steps:
-        with stopping_on_failure(apparatus.stage):
-            apparatus.stage.reference()
-            deadline = frame.stop + round(LONGEST_SECONDS * frame.rate)
+        stage = apparatus.stage
+        with stopping_on_failure(stage):
+            stage.reference()
+            left = LONGEST_SECONDS * frame.rate
             frame = yield
-            while frame.stage.moving or not apparatus.stage.referenced:
-                if frame.stop > deadline:
+            while frame.stage.moving or not stage.referenced:
+                if frame.resumed and not stage.referenced:
+                    stage.reference()
+                left -= frame.force.size
+                if left < 0:
                     raise StepFailed("reference", "the switch is not found", "check the stage's cable and its switches")
                 frame = yield
-            apparatus.stage.servo(True)
+            stage.servo(True)
         return frame
 
     def park(frame: Frame) -> Steps:
-        target = apparatus.stage.travel[1] if start is None else start
-        motion = Motion(apparatus, target, PARK_SPEED)
-        deadline = frame.stop + round(LONGEST_SECONDS * frame.rate)
-        try:
-            while not motion.arrived(frame):
-                motion.extend(frame)
-                frame = yield
-                apparatus.tell.progress(frame.stage.position, target, "m")
-                if frame.stop > deadline:
-                    raise StepFailed("park", "the stage does not arrive", "check the path and the stage's servo")
-        finally:
-            apparatus.stage.stop()
-        return frame
+        zero = float(frame.force.mean())
+
+        def watch(frame: Frame) -> None:
+            force = float(frame.force.mean()) - zero
+            if abs(force) > parking.touch:
+                raise StepFailed(
+                    "park",
+                    f"something is in the way at {frame.stage.position * 1e3:.3f} mm, force {force:+.3f} N",
+                    "take specimen and gripper out of the stage's path, or correct start_mm in the bench file",
+                )
+
+        return travel(careful, start, parking.speed, "park", frame, watch)
 
     return [Step("reference", "the switch is found", seek), Step("park", "at the starting height", park)]

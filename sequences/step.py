@@ -1,7 +1,7 @@
 """What a step is, and how steps follow one another.
 
 A step is a generator: it commands the stage or the pump, then ``frame = yield`` until its condition holds; its
-``finally`` stops what it started. Time is counted in samples, never on the wall.
+``finally`` stops what it started. Time is counted in the samples it is given: neither the wall nor a hold counts.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.interfaces import Pump, Stage
+from sequences.errors import StepFailed
 from sequences.frame import Frame
 
 Steps = Generator[None, Frame, Frame]
@@ -82,10 +83,11 @@ def play(steps: Sequence[Step], tell: Teller) -> Generator[None, Frame, None]:
 
 def rest(apparatus: Apparatus, seconds: float, frame: Frame) -> Steps:
     """Let so much time pass, counted in samples."""
-    begin = frame.stop
-    while frame.stop - begin < seconds * frame.rate:
+    rested = 0
+    while rested < seconds * frame.rate:
         frame = yield
-        apparatus.tell.progress((frame.stop - begin) / frame.rate, seconds, "s")
+        rested += frame.force.size
+        apparatus.tell.progress(rested / frame.rate, seconds, "s")
     return frame
 
 
@@ -140,10 +142,10 @@ class Motion:
     def extend(self, frame: Frame) -> None:
         """Command the next stretch when half of the last one has been travelled."""
         position, ahead = frame.stage.position, self._look_ahead
-        stretch = max(min(self._target - position, ahead), -ahead)
         if self._is_due(frame, position, ahead):
             low, high = self._apparatus.stage.travel
-            self._commanded = min(max(position + stretch, low), high)
+            way = min(max(self._target, low), high) - position
+            self._commanded = position + max(min(way, ahead), -ahead)
             self._apparatus.stage.move_to(self._commanded)
 
     def arrived(self, frame: Frame) -> bool:
@@ -157,3 +159,46 @@ class Motion:
         if abs(self._commanded - self._target) < self._RESOLUTION:
             return not frame.stage.moving and left > 2 * self._RESOLUTION
         return left < ahead / 2 or not frame.stage.moving
+
+
+def travel(
+    apparatus: Apparatus,
+    target: float,
+    speed: float,
+    name: str,
+    frame: Frame,
+    watch: Callable[[Frame], None] = lambda frame: None,
+) -> Steps:
+    """Go to a height (m) at a speed (m/s), or as fast as the look-ahead allows.
+
+    Parameters
+    ----------
+    name
+        Of the step, for its failure.
+    watch
+        Called with every frame; what it raises stops the motion.
+
+    Raises
+    ------
+    StepFailed
+        It takes much longer than it should.
+    """
+    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.look_ahead, frame.force.size / frame.rate)))
+    left = (3 * abs(target - frame.stage.position) / motion.speed + 5) * frame.rate
+    try:
+        while not motion.arrived(frame):
+            motion.extend(frame)
+            frame = yield
+            watch(frame)
+            apparatus.tell.progress(frame.stage.position, target, "m")
+            left -= frame.force.size
+            if left < 0:
+                raise StepFailed(name, "the stage does not arrive", "check the path and the stage's servo")
+    finally:
+        apparatus.stage.stop()
+    return frame
+
+
+def steady_speed(look_ahead: float, frame: float) -> float:
+    """Return the fastest speed (m/s) at which a look-ahead (m) outlasts several frames (s): no stutter."""
+    return look_ahead / 4 / frame

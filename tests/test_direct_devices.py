@@ -204,6 +204,15 @@ def test_targets_outside_the_travel_are_refused(bench, target):
         bench.stage().set_speed(0.0)
 
 
+def test_from_outside_the_travel_the_axis_may_come_back_and_go_no_further(bench):
+    stage = bench.stage(minimum=10e-3, maximum=20e-3)
+    assert stage.status().position == pytest.approx(22e-3)
+    stage.move_to(21e-3)
+    for target in (22.1e-3, 9e-3):
+        with pytest.raises(OutOfRange, match="outside the travel"):
+            stage.move_to(target)
+
+
 def test_an_unreferenced_axis_does_not_move_until_it_is_referenced():
     with EmulatedBench(Truth.pull_off(), wire=False) as bench:
         stage, daq = bench.stage(), bench.daq("force")
@@ -242,6 +251,17 @@ def test_a_hurt_wire_to_the_stage(stage, faults, kind, error):
         stage.status()
     faults.clear()
     assert stage.status().servo_on
+
+
+def test_no_stop_byte_reaches_an_unplugged_stage(bench, stage, daq, faults):
+    stage.set_speed(2e-3)
+    stage.move_to(24e-3)
+    settle(daq, stage, 0.2)
+    faults.add(Fault("stage", "unplugged"))
+    with pytest.raises(NotConnected):
+        stage.emergency_stop()
+    daq.read(2000)
+    assert bench.plant.axis.position == pytest.approx(24e-3, abs=1e-6)
 
 
 def test_a_limit_switch_and_a_lost_servo(stage, daq, faults):

@@ -244,7 +244,12 @@ def test_strokes_beyond_the_pressure_limits_are_refused():
 
 def test_compliance_may_be_measured_on_a_bench_that_does_not_know_it_yet():
     bench, _ = load_bench(None)
-    new = bench.model_copy(update={"force": bench.force.model_copy(update={"compliance_um_per_N": 0.0})})
+    new = bench.model_copy(
+        update={
+            "force": bench.force.model_copy(update={"compliance_um_per_N": 0.0}),
+            "limits": bench.limits.model_copy(update={"look_ahead_um": 40.0}),
+        }
+    )
     check(parse_scene(scene_text("compliance"), "compliance"), new)
     assert "run the scene `compliance`" in refused("sphere-60mm-vented", bench=new)
 

@@ -78,6 +78,18 @@ def test_look_ahead_extends_a_running_move(stage, world):
     assert stage.status().position == pytest.approx(22e-3 - 100e-6 - 50e-6, abs=5e-6)
 
 
+def test_from_outside_the_travel_the_axis_may_come_back_and_go_no_further(server, world):
+    stage = PIStage(server.url, minimum=10e-3, maximum=20e-3)
+    with pytest.raises(OutOfRange):
+        stage.move_to(21e-3)  # nobody has asked where it is
+    assert stage.status().position == pytest.approx(22e-3)
+    stage.move_to(21e-3)
+    for target in (22.1e-3, 9e-3):
+        with pytest.raises(OutOfRange):
+            stage.move_to(target)
+    stage.close()
+
+
 def test_stop_brakes_and_leaves_no_error(stage, world):
     stage.move_to(40e-3)
     world.pass_time(1)

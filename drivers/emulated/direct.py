@@ -49,15 +49,20 @@ REMEDY = "this is the emulated bench: look at its fault script"
 
 def check_wire(world: World, device: str) -> None:
     """Raise what a driver would if the fault script has hurt the wire to this instrument."""
+    check_plugged(world, device)
     faults = world.faults
     if not faults.scheduled:
         return
-    if faults.active(device, "unplugged"):
-        raise NotConnected(device, "the connection has been closed by the far end", REMEDY)
     if faults.active(device, "silent"):
         raise NoReply(device, "no reply", REMEDY)
     if faults.active(device, "garbage"):
         raise BadReply(device, "the reply makes no sense", REMEDY)
+
+
+def check_plugged(world: World, device: str) -> None:
+    """Raise what a driver would where nothing reaches the instrument."""
+    if world.faults.scheduled and world.faults.active(device, "unplugged"):
+        raise NotConnected(device, "the connection has been closed by the far end", REMEDY)
 
 
 class DirectStage:
@@ -100,6 +105,7 @@ class DirectStage:
             ends[0] if minimum is None else max(ends[0], minimum),
             ends[1] if maximum is None else min(ends[1], maximum),
         )
+        self._position = self._travel[0]
         self._ask("ERR?")
 
     @property
@@ -143,6 +149,7 @@ class DirectStage:
         """
         sent = self._clock()
         word, position = self._poll()
+        self._position = self._scale * position
         received = self._clock()
         error = int(self._ask("ERR?")) if word & ERROR else 0
         self._check_health(word, error)
@@ -150,7 +157,7 @@ class DirectStage:
         return StageStatus(
             sent=sent,
             received=received,
-            position=self._scale * position,
+            position=self._position,
             moving=bool(word & (MOVING | REFERENCING)),
             on_target=bool(word & ON_TARGET),
             servo_on=bool(word & SERVO_ON),
@@ -166,9 +173,9 @@ class DirectStage:
         self._command(f"VEL 1 {speed * 1e3}")
 
     def move_to(self, position: float) -> None:
-        """Start or redirect a move to ``position`` (m, within ``travel``)."""
+        """Start or redirect a move to ``position`` (m, within ``travel``, or on the way back to it)."""
         low, high = self._travel
-        if not low <= position <= high:
+        if not min(low, self._position) <= position <= max(high, self._position):
             raise OutOfRange(
                 "stage",
                 f"target {position * 1e3:.6g} mm lies outside the travel {low * 1e3:.6g} .. {high * 1e3:.6g} mm",
@@ -189,6 +196,7 @@ class DirectStage:
     def emergency_stop(self) -> None:
         """Stop dead, from any thread; moves are refused until ``stop`` acknowledges."""
         self._stop_pressed = True
+        check_plugged(self._world, "stage")
         self._controller.control(0x18)
 
     def close(self) -> None:
