@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,6 +42,10 @@ class Condition:
         Nominal P_0, Pa gauge, or ``None`` vented.
     place
         Position on the membrane (indentation) or name of the sample; empty where there is none.
+    details
+        Symbol and value of every other setting: gripper, membrane, preload, speeds, dwell.
+    shown
+        Symbols of the details in which conditions of this kind differ; ``group`` finds them, the name holds them.
     """
 
     protocol: str
@@ -50,17 +54,22 @@ class Condition:
     diameter: float = 0.0
     pressure: float | None = None
     place: str = ""
+    details: tuple[tuple[str, str], ...] = ()
+    shown: tuple[str, ...] = field(default=(), compare=False)
 
     @classmethod
     def of(cls, run: Run) -> Condition:
         """Read the condition from the run's scene."""
         gripper = str(run.settings.get("gripper", "rigid"))
         place = str(run.settings.get("position", run.settings.get("sample", "")))
+        details = tuple(_details(run))
         if run.parameters is None:
-            return cls(run.protocol, gripper, place=place)
+            return cls(run.protocol, gripper, place=place, details=details)
         substrate = run.parameters.substrate
         pressure = None if run.pressure is None else run.parameters.gas.initial_pressure
-        return cls(run.protocol, gripper, substrate.shape == "flat", substrate.diameter or 0.0, pressure, place)
+        return cls(
+            run.protocol, gripper, substrate.shape == "flat", substrate.diameter or 0.0, pressure, place, details
+        )
 
     @property
     def substrate(self) -> str:
@@ -69,12 +78,49 @@ class Condition:
             return f"flat disk {self.diameter * 1e3:g} mm" if self.diameter else "Flat Glass"
         return f"d_b {self.diameter * 1e3:g} mm"
 
+    @property
+    def distinction(self) -> str:
+        """What tells this condition from others of its kind; empty where nothing has to."""
+        return ", ".join(f"{symbol} {value}" for symbol, value in self.details if symbol in self.shown)
+
     def __str__(self) -> str:
-        pressure = "vented" if self.pressure is None else f"P_0 = {self.pressure / 1e3:+.1f} kPa"
+        pressure = "vented" if self.pressure is None else f"P_0 = {_kilopascal(self.pressure)}"
         parts = [self.substrate, pressure] if self.protocol == "pull_off" else [self.protocol, self.place]
         if self.gripper != "rigid":
             parts.insert(0, f"{self.gripper} gripper")
-        return ", ".join(part for part in parts if part)
+        return ", ".join(part for part in (*parts, self.distinction) if part)
+
+
+_SETTINGS = {
+    "preload": ("preload_N", "N"),
+    "approach": ("approach_speed_um_s", "µm/s"),
+    "retraction": ("retract_speed_um_s", "µm/s"),
+    "dwell": ("preload_dwell_s", "s"),
+    "R": ("indenter_radius_mm", "mm"),
+    "fibers": ("fibers", ""),
+}
+"""Settings of a protocol that make another condition: symbol, key of the scene and unit."""
+
+
+def _details(run: Run) -> Iterator[tuple[str, str]]:
+    if run.parameters is not None:
+        gripper, membrane = run.parameters.gripper, run.parameters.membrane
+        yield "R_0", f"{gripper.radius * 1e3:g} mm"
+        yield "r_e", f"{gripper.effective_radius * 1e3:g} mm"
+        yield "V_0", f"{gripper.chamber_volume * 1e6:g} mL"
+        yield "E_m", f"{membrane.youngs_modulus * 1e-6:g} MPa"
+        yield "h_0", f"{membrane.thickness * 1e6:g} µm"
+        yield "ω_a", f"{membrane.work_of_adhesion:g} J/m²"
+        if run.pressure is not None and run.protocol != "pull_off":
+            yield "P_0", _kilopascal(run.parameters.gas.initial_pressure)
+    for symbol, (key, unit) in _SETTINGS.items():
+        if key in run.settings:
+            yield symbol, f"{run.settings[key]:g} {unit}".strip()
+
+
+def _kilopascal(pressure: float) -> str:
+    tenths = f"{pressure / 1e3:+.1f}"
+    return f"{tenths if abs(float(tenths) * 1e3 - pressure) < 1e-6 else f'{pressure / 1e3:+g}'} kPa"
 
 
 @dataclass(frozen=True)
@@ -153,13 +199,30 @@ def group(analyses: Iterable[Analysis]) -> list[Group]:
     members: dict[Condition, list[Analysis]] = {}
     for analysis in analyses:
         members.setdefault(Condition.of(analysis.run), []).append(analysis)
-    order = sorted(members, key=_order)
-    return [Group(condition, tuple(members[condition]), _outliers(members[condition])) for condition in order]
+    named = sorted(map(_named(members), members), key=_order)
+    return [Group(condition, tuple(members[condition]), _outliers(members[condition])) for condition in named]
 
 
-def _order(condition: Condition) -> tuple[str, str, bool, float, float, str]:
+def _named(conditions: Iterable[Condition]) -> Callable[[Condition], Condition]:
+    """Return what gives a condition the details to be named by: those that differ within its kind at any pressure."""
+    found: dict[Condition, dict[str, set[str]]] = {}
+    for condition in conditions:
+        kind = found.setdefault(_kind(condition), {})
+        for symbol, value in condition.details:
+            kind.setdefault(symbol, set()).add(value)
+    return lambda condition: replace(
+        condition, shown=tuple(symbol for symbol, values in found[_kind(condition)].items() if len(values) > 1)
+    )
+
+
+def _kind(condition: Condition) -> Condition:
+    return replace(condition, pressure=None, details=())
+
+
+def _order(condition: Condition) -> tuple[str, str, bool, float, float, str, tuple[tuple[str, str], ...]]:
     pressure = np.inf if condition.pressure is None else -condition.pressure
-    return (condition.protocol, condition.gripper, condition.flat, condition.diameter, pressure, condition.place)
+    kind = (condition.protocol, condition.gripper, condition.flat, condition.diameter)
+    return (*kind, pressure, condition.place, condition.details)
 
 
 def _outliers(members: Sequence[Analysis]) -> dict[str, str]:

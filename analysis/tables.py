@@ -18,7 +18,7 @@ from analysis.derived import (
 )
 from analysis.published import TABLE_S3, TABLE_S4, JkrTable
 from analysis.quantity import Quantity, with_uncertainty
-from analysis.repeats import Group, Pooled
+from analysis.repeats import Condition, Group, Pooled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -97,7 +97,8 @@ def characterization(groups: Iterable[Group], gripper: str = "rigid", reference:
     for members in groups:
         condition = members.condition
         if condition.protocol == "pull_off" and condition.gripper == gripper and members.pooled("pull_off_force_N"):
-            columns.setdefault(condition.substrate, []).append(members)
+            name = ", ".join(filter(None, (condition.substrate, condition.distinction)))
+            columns.setdefault(name, []).append(members)
     cells = {substrate: _column(found, stress) for substrate, found in columns.items()}
     labels = (
         "Contact Area, A_c [cm²]",
@@ -192,7 +193,7 @@ def jkr_summary(groups: Iterable[Group], gripper: str = "rigid") -> Table:
     found = [m for m in found if m.pooled("pull_off_force_N")]
     rows = [
         (
-            m.condition.place or str(m.condition),
+            _place(m.condition),
             _pooled_text(m, "pull_off_force_N", 1e3),
             _pooled_text(m, "projected_area_m2", 1e6),
         )
@@ -211,7 +212,19 @@ def jkr_summary(groups: Iterable[Group], gripper: str = "rigid") -> Table:
     number = "S3" if gripper == "rigid" else "S4"
     title = f"Table {number} | Summary of F_off, ω_ad and σ_ad of the FAM for the {gripper} adhesion system"
     header = ("Position", "Pull-off force, F_off [mN]", "Projected Contact Area, A_pc [mm²]")
-    return Table(title, header, tuple(rows), ("AVG. ± standard uncertainty of the mean over positions.",))
+    notes = ("AVG. ± standard uncertainty of the mean over positions.", *_mixed(found))
+    return Table(title, header, tuple(rows), notes)
+
+
+def _place(condition: Condition) -> str:
+    """Name a row: the place on the membrane or the sample, and what tells it from others there."""
+    return ", ".join(filter(None, (condition.place, condition.distinction))) or str(condition)
+
+
+def _mixed(groups: Iterable[Group]) -> tuple[str, ...]:
+    """Warn of an average over what does not belong together."""
+    different = any(members.condition.distinction for members in groups)
+    return ("AVG. is over different conditions, as the rows name them.",) if different else ()
 
 
 def _pooled_text(members: Group, feature: str, factor: float) -> str:
@@ -255,7 +268,7 @@ def fiber_samples(groups: Iterable[Group]) -> list[FiberSample]:
         real, projected = (None if area is None else _quantity(area) for area in areas)
         force = _mean(members, "pull_off_force_N")
         fibers = int(members.kept[0].run.settings.get("fibers", 3))
-        found.append(FiberSample(members.condition.place, force, real, projected, fibers))
+        found.append(FiberSample(_place(members.condition), force, real, projected, fibers))
     return found
 
 

@@ -99,3 +99,29 @@ def test_groups_follow_substrate_and_pressure() -> None:
 def test_condition_of_a_run_without_model() -> None:
     run = replace(made_run(0.5, 0), parameters=None, protocol="indentation", settings={"position": "Left"})
     assert str(Condition.of(run)) == "indentation, Left"
+
+
+def test_other_membranes_and_settings_are_other_conditions() -> None:
+    thick = replace(SCENE, membrane=replace(SCENE.membrane, thickness=400e-6, work_of_adhesion=8.0))
+    wide = replace(SCENE, gripper=replace(SCENE.gripper, chamber_volume=14.4e-6))
+    slow = {"preload_N": 0.5, "retract_speed_um_s": 10.0, "preload_dwell_s": 30.0}
+    fast = {**slow, "retract_speed_um_s": 100.0, "preload_dwell_s": 2.0}
+    runs = [replace(made_run(0.5, seed), settings=slow) for seed in range(2)]
+    runs += [replace(made_run(0.5, 2, thick), settings=slow), replace(made_run(0.5, 3), settings=fast)]
+    runs.append(replace(made_run(0.5, 4, wide), settings=slow))
+    groups = group(analyze(run, uncertainties=False) for run in runs)
+    names = {str(members.condition): len(members.members) for members in groups}
+    same = "d_b 60 mm, P_0 = -0.5 kPa, "
+    assert names == {
+        same + "V_0 7.2 mL, h_0 200 µm, ω_a 4 J/m², retraction 10 µm/s, dwell 30 s": 2,
+        same + "V_0 7.2 mL, h_0 400 µm, ω_a 8 J/m², retraction 10 µm/s, dwell 30 s": 1,
+        same + "V_0 7.2 mL, h_0 200 µm, ω_a 4 J/m², retraction 100 µm/s, dwell 2 s": 1,
+        same + "V_0 14.4 mL, h_0 200 µm, ω_a 4 J/m², retraction 10 µm/s, dwell 30 s": 1,
+    }
+
+
+def test_a_pressure_between_the_tenths_is_named_in_full() -> None:
+    pressures = (-500.0, -520.0, -525.5)
+    runs = [made_run(0.5, i, SCENE.with_changes(initial_pressure=p)) for i, p in enumerate(pressures)]
+    names = [str(members.condition) for members in group(analyze(run, uncertainties=False) for run in runs)]
+    assert [name.partition("P_0 = ")[2] for name in names] == ["-0.5 kPa", "-0.52 kPa", "-0.5255 kPa"]

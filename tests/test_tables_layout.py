@@ -214,3 +214,12 @@ def test_tables_render_and_escape() -> None:
     assert "&lt;b&gt;" in table.html()
     assert "note &amp; more" in table.html()
     assert list(table.frame().columns) == ["a", "b"]
+
+
+def test_tables_keep_different_membranes_apart() -> None:
+    thin = Parameters(Substrate("flat"), gas=Gas(initial_pressure=1600.0))
+    thick = replace(thin, membrane=replace(thin.membrane, thickness=400e-6), gas=Gas(initial_pressure=-2900.0))
+    runs = [run_of(0.5, parameters=thin), run_of(1.1, parameters=thick)]
+    table = characterization(group(analyze(run, uncertainties=False) for run in runs))
+    assert table.header[1:] == ("Flat Glass, h_0 200 µm", "Flat Glass, h_0 400 µm")
+    assert cell(table, "Enhancing", "Flat Glass, h_0 200 µm") == "N/A"

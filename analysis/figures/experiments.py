@@ -20,14 +20,14 @@ from analysis.figures.parts import (
 )
 from analysis.figures.registry import Material, paper_figure
 from analysis.figures.run_overview import draw_against_time
-from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, MARKERS, ORANGE, PURPLE
+from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, MARKERS, ORANGE, PURPLE, plain
 from analysis.indentation import fit_contact, indenter_radius
 from analysis.numerics import running_mean
 from analysis.pipeline import Analysis
 from analysis.published import experiments
 from analysis.repeats import Group
 from model import jkr
-from model.parameters import Parameters
+from model.parameters import Gripper, Membrane, Parameters
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -108,7 +108,7 @@ def _add_thinned(series: Series, analysis: Analysis) -> None:
     columns = {"time_s": run.time[keep], "force_N": running_mean(analysis.force, width)[keep]}
     if run.pressure is not None:
         columns["pressure_Pa"] = running_mean(run.pressure, width)[keep]
-    series.add(run.name, "measured", **columns)
+    series.add(run.name, "measured", [analysis], **columns)
 
 
 @paper_figure("2b", "EML 2b: force and pressure against retraction, repeats as bands", (6.0, 4.0))
@@ -144,7 +144,8 @@ def _by_pressure(figure: Figure, material: Material, diameter: float) -> pd.Data
     groups = _of_substrate(material, diameter)
     if groups:
         for members, color in zip(groups, shades(len(groups)), strict=True):
-            label = "vented" if members.condition.pressure is None else kilopascal(members.condition.pressure)
+            gas = "vented" if members.condition.pressure is None else kilopascal(members.condition.pressure)
+            label = ", ".join(filter(None, (gas, members.condition.distinction)))
             draw_band(axes, members, color, label, series)
         axes.set_title(f"$d_b$ = {diameter * 1e3:g} mm", loc="left")
     else:
@@ -196,6 +197,7 @@ def _spheres(figure: Figure, material: Material, *, highest: bool, with_model: b
         if members is not None:
             parameters = _parameters(members)
             label = f"{diameter * 1e3:g} mm, {kilopascal(members.condition.pressure or 0.0)}"
+            label = ", ".join(filter(None, (label, members.condition.distinction)))
             draw_band(axes, members, color, label, series)
         if with_model or members is None:
             draw_model(axes, material.predict(parameters), color, "" if members else label, series, name=label)
@@ -271,17 +273,25 @@ def figure_5c(figure: Figure, material: Material) -> pd.DataFrame:
         low, high = float(ends.min()), float(ends.max())
         margin = 0.05 * (high - low)
         pressures = np.linspace(low - margin, high + margin, 15)
-        base = _parameters(groups[0]) if groups else scene(diameter, 0.0)
-        predictions = [material.predict(base.with_changes(initial_pressure=float(p))) for p in pressures]
-        forces = np.array([prediction.pull_off_force for prediction in predictions])
-        axes.plot(pressures * 1e-3, forces, "--", color=color, label=None if groups else label)
-        series.add(label, f"model {material.model}", initial_pressure_Pa=pressures, pull_off_force_N=forces)
+        for base in _gripping(groups) if groups else [scene(diameter, 0.0)]:
+            predictions = [material.predict(base.with_changes(initial_pressure=float(p))) for p in pressures]
+            forces = np.array([prediction.pull_off_force for prediction in predictions])
+            axes.plot(pressures * 1e-3, forces, "--", color=color, label=None if groups else label)
+            series.add(label, f"model {material.model}", initial_pressure_Pa=pressures, pull_off_force_N=forces)
     axes.plot([], [], "o", color=BLACK, markerfacecolor="none", label="published, Table S1")
     axes.set_xlabel("Initial pressure $P_0$ [kPa]")
     axes.set_ylabel("Pull-off force $F_p$ [N]")
     axes.set_ylim(bottom=0)
     axes.legend(title="$d_b$")
     return series.frame()
+
+
+def _gripping(groups: Sequence[Group]) -> list[Parameters]:
+    """Return one scene for each gripper and membrane among the groups."""
+    found: dict[tuple[Gripper, Membrane], Parameters] = {}
+    for parameters in map(_parameters, groups):
+        found.setdefault((parameters.gripper, parameters.membrane), parameters)
+    return list(found.values())
 
 
 def _printed(
@@ -308,6 +318,7 @@ def _measured_points(
     series.add(
         label,
         "measured",
+        [member for members in groups for member in members.kept],
         initial_pressure_Pa=pressure,
         pull_off_force_N=mean,
         pull_off_force_standard_deviation_N=spread,
@@ -335,7 +346,7 @@ def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
         found = [m for m in material.groups if m.condition.protocol == "indentation" and m.condition.gripper == gripper]
         if found:
             _draw_indentation(axes, found[0].kept[0], series)
-            axes.set_title(f"{letter}  {gripper} system, {found[0].condition.place}", loc="left")
+            axes.set_title(f"{letter}  {gripper} system, {plain(found[0].condition.place)}", loc="left")
         else:
             curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=JKR_CONTACT)
             last = curve.indentation[-1] * 1e3
@@ -355,7 +366,7 @@ def _draw_indentation(axes: Axes, analysis: Analysis, series: Series) -> None:
     width = max(1, work.force.size // 4000)
     force, depth = running_mean(work.force, width)[::width], origin - work.separation[::width]
     axes.plot(depth * 1e3, force * 1e3, color=BLUE, label="measured")
-    series.add(analysis.run.name, "measured", displacement_m=depth, force_N=force)
+    series.add(analysis.run.name, "measured", [analysis], displacement_m=depth, force_N=force)
     if "detachment" not in work.details:
         return
     deepest, last = float(depth.max()) * 1e3, (origin - work.release_separation) * 1e3

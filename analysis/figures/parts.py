@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
+    from analysis.pipeline import Analysis
     from model.prediction import Prediction
 
 PAPER_MEMBRANE = Membrane(youngs_modulus=2.0e6, thickness=200e-6, work_of_adhesion=4.0)
@@ -39,25 +41,32 @@ def scene(
 
 
 class Series:
-    """Collects what a figure draws into one long table."""
+    """Collects what a figure draws into one long table, and the names of the runs it is drawn from."""
 
     def __init__(self) -> None:
         self._rows: list[pd.DataFrame] = []
+        self._runs: list[str] = []
 
-    def add(self, series: str, source: str, **columns: Array) -> None:
-        """Add one line: its name, ``"measured"`` or ``"model ..."``, and its columns with units in their names."""
+    def add(self, series: str, source: str, runs: Iterable[Analysis] = (), **columns: Array) -> None:
+        """Add one line: its name, ``"measured"`` or ``"model ..."``, and its columns with units in their names.
+
+        ``runs`` are those that a measured line shows.
+        """
         import pandas as pd
 
+        self._runs += [analysis.run.name for analysis in runs]
         frame = pd.DataFrame(columns)
         frame.insert(0, "source", source)
         frame.insert(0, "series", series)
         self._rows.append(frame)
 
     def frame(self) -> pd.DataFrame:
-        """Return the long table."""
+        """Return the long table; its ``attrs["runs"]`` names the runs."""
         import pandas as pd
 
-        return pd.concat(self._rows, ignore_index=True) if self._rows else pd.DataFrame(columns=["series", "source"])
+        table = pd.concat(self._rows, ignore_index=True) if self._rows else pd.DataFrame(columns=["series", "source"])
+        table.attrs["runs"] = self._runs
+        return table
 
 
 def profile_axes(axes: Axes) -> None:
@@ -81,7 +90,7 @@ def draw_band(axes: Axes, members: Group, color: str, label: str, series: Series
     columns = {"retraction_m": place, "force_N": force, "force_standard_deviation_N": spread}
     if mean.pressure is not None:
         columns["pressure_Pa"] = mean.pressure[shown]
-    series.add(label, "measured", **columns)
+    series.add(label, "measured", members.kept, **columns)
     return mean
 
 

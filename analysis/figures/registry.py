@@ -33,10 +33,13 @@ class Material:
         Analysed recordings by condition; empty: the models alone.
     model
         Which model draws the theory: ``"cone"``, ``"cone-2017"``, ``"membrane"``.
+    used
+        Names of the runs that figures drawn so far show.
     """
 
     groups: Sequence[Group] = ()
     model: str = "cone"
+    used: set[str] = field(default_factory=set)
     _known: dict[tuple[Parameters, str], Prediction] = field(default_factory=dict)
 
     def predict(self, parameters: Parameters, model: str | None = None) -> Prediction:
@@ -115,6 +118,7 @@ def draw(number: str, material: Material, path: Path) -> Path:
     with canvas(*chosen.size) as figure:
         data = chosen.draw(figure, material)
         save(figure, path)
+    material.used.update(data.attrs.get("runs", ()))
     table = path.with_suffix(".csv")
     table.write_text(data.to_csv(index=False, float_format="%.9g", lineterminator="\n"), encoding="utf-8")
     return table

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.errors import UnknownFormat
 from analysis.numerics import Array
 
 if TYPE_CHECKING:
@@ -56,22 +57,44 @@ def canvas(width: float = 7.0, height: float = 5.0) -> Iterator[Figure]:
         yield figure
 
 
+FORMATS: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+"""Formats of pictures, and what of their metadata changes from one writing to the next."""
+
+
+def format_of(path: Path) -> str:
+    """Return the format that the ending of a picture's name asks for.
+
+    Raises
+    ------
+    UnknownFormat
+        It is none of ``FORMATS``.
+    """
+    kind = path.suffix.lstrip(".").lower() or "png"
+    if kind not in FORMATS:
+        raise UnknownFormat(f"picture {path}: no format {kind!r}. Remedy: end its name in .{', .'.join(FORMATS)}.")
+    return kind
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write PNG, SVG or PDF by the ending of ``path``; same content, same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encode(figure, path.suffix.lstrip(".").lower() or "png"))
+    path.write_bytes(encode(figure, format_of(path)))
 
 
 def encode(figure: Figure, kind: str = "png") -> bytes:
     """Return the picture's bytes without dates and versions."""
     stream = io.BytesIO()
-    absent = {
-        "png": {"Software": None},
-        "svg": {"Date": None, "Creator": None},
-        "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-    }
-    figure.savefig(stream, format=kind, metadata=absent[kind])
+    figure.savefig(stream, format=kind, metadata=FORMATS[kind])
     return stream.getvalue()
+
+
+def plain(text: object) -> str:
+    """Return a text that Matplotlib shows as it is: names of files and scenes are no formulas."""
+    return str(text).replace("$", r"\$")
 
 
 def thin(x: Array, y: Array, count: int = 2000) -> tuple[Array, Array]:
