@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeVar
 
+from analysis.errors import NoScheduler
 from analysis.pipeline import Analysis, analyze, lighten
 from analysis.run import Run
 from model.errors import ModelError
 from model.prediction import Prediction
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
+
+
+ANSWER_SECONDS = 10
+"""How long a scheduler may take to answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a run came from.
+
+    Attributes
+    ----------
+    path
+        The recording as it was named on the command line.
+    name
+        Its name in pages, without folders that are not needed to tell it from others.
+    sha256
+        Of the file.
+    metadata
+        What the recording says of its making: bench, scene, calibrations, versions.
+    """
+
+    path: str
+    name: str
+    sha256: str
+    metadata: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -29,6 +60,8 @@ class Analyzed:
         Of the run's scene, or why there is none.
     overview, reasons
         The pictures as PNG; empty where none were wanted.
+    source
+        The recording, where there is one.
     """
 
     analysis: Analysis
@@ -38,6 +71,7 @@ class Analyzed:
     no_prediction: str = ""
     overview: bytes = b""
     reasons: bytes = b""
+    source: Source | None = None
 
 
 def analyze_run(run: Run, *, model: str = "cone", pictures: bool = False, uncertainties: bool = True) -> Analyzed:
@@ -92,13 +126,16 @@ def on_all_cores(
         Number of processes; ``None``: one per core, 1: none but this one.
     scheduler
         Address of a Dask scheduler; overrides ``workers``.
+
+    Raises
+    ------
+    NoScheduler
+        None answers there.
     """
     import os
 
     if scheduler is not None:
-        from distributed import Client
-
-        with Client(scheduler) as client:
+        with connected(scheduler) as client:
             yield from (future.result() for future in client.map(function, items, pure=False))
         return
     count = min(workers or os.cpu_count() or 1, len(items))
@@ -110,3 +147,27 @@ def on_all_cores(
 
     with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
         yield from pool.map(function, items)
+
+
+@contextmanager
+def connected(scheduler: str) -> Iterator[Client]:
+    """Give a client of a Dask scheduler.
+
+    Raises
+    ------
+    NoScheduler
+        None answers there, or Dask is not installed.
+    """
+    try:
+        from distributed import Client
+
+        client = Client(scheduler, timeout=f"{ANSWER_SECONDS}s")
+    except ImportError as error:
+        raise NoScheduler(f"scheduler {scheduler}: {error}. Remedy: install the extra `cluster`.") from error
+    except (OSError, ValueError) as error:
+        raise NoScheduler(
+            f"scheduler {scheduler}: no Dask scheduler answers ({str(error).splitlines()[0]}). "
+            "Remedy: start one with `dask scheduler`, and give its address, such as tcp://host:8786."
+        ) from error
+    with client:
+        yield client

@@ -20,6 +20,9 @@ def draw_load_sharing(
     """Draw sigma_22 in the film at the last load, and along the interface at every load, stuck and with fibres."""
     from matplotlib.figure import Figure
 
+    from analysis.figures.style import format_of, plain
+
+    kind = format_of(path)
     figure = Figure(figsize=(9, 10), layout="constrained")
     top, wide, near = figure.subplots(3, 1, height_ratios=[1, 1.4, 1.4])
     _map(figure, top, fibred, Load(*loads[-1]))
@@ -47,8 +50,8 @@ def draw_load_sharing(
     )
     near.axhline(0, color="0.7", lw=0.8, zorder=0)
     near.legend(frameon=False, fontsize="small", ncols=2)
-    figure.suptitle(f"{title}: load sharing, {fibred.formulation.value}")
-    figure.savefig(path, dpi=130)
+    figure.suptitle(f"{plain(title)}: load sharing, {fibred.formulation.value}")
+    figure.savefig(path, dpi=130, format=kind)
 
 
 def _map(figure: object, axes: object, solved: LoadSharing, load: Load) -> None:

@@ -15,16 +15,19 @@ def draw_prediction(prediction: Prediction, title: str, path: Path) -> None:
     """Write force and pressure against retraction to ``path``, peak and detachment marked."""
     from matplotlib.figure import Figure
 
+    from analysis.figures.style import format_of, plain
+
+    kind = format_of(path)
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     axes = figure.subplots()
-    axes.set_title(f"{title} - {prediction.label}")
+    axes.set_title(f"{plain(title)} - {prediction.label}")
     axes.set_xlabel("retraction $z_r$ (mm)")
     axes.set_ylabel("reaction force $F_r$ (N), compression positive", color=FORCE)
     if prediction.position.size == 0:
         axes.text(0.5, 0.5, prediction.outcome.value, ha="center", va="center", transform=axes.transAxes)
     else:
         _draw_profile(prediction, axes)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=150, format=kind)
 
 
 def _draw_profile(prediction: Prediction, axes) -> None:  # type: ignore[no-untyped-def]

@@ -57,6 +57,8 @@ def sweep(
     ------
     InvalidParameter
         The model is unknown.
+    NoScheduler
+        None answers at the address.
     """
     import pandas as pd
 
@@ -91,9 +93,9 @@ def _on_processes(model: str, blocks: list[list[Parameters]], processes: int) ->
 
 
 def _on_cluster(model: str, blocks: list[list[Parameters]], scheduler: str) -> Iterator[list[Row]]:
-    from distributed import Client
+    from analysis.batch import connected
 
-    with Client(scheduler, timeout="30s") as client:
+    with connected(scheduler) as client:
         for future in client.map(solve_block, [model] * len(blocks), blocks, pure=False):
             yield future.result()
 

@@ -240,3 +240,56 @@ def test_scipy_and_matplotlib_stay_out_of_a_prediction():
         [sys.executable, "-c", script, "predict", str(SPHERE), "--json"], capture_output=True, check=False, timeout=60
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", ["fiber", "volume", "leak", "punch", "compliance"])
+def test_protocols_without_a_model_are_refused(capsys, name):
+    for words in (["predict", name], ["predict", name, "--rigid-bound"], ["sweep", name, "--vary", "radius_mm=8,9"]):
+        code, out, err = run(capsys, *words)
+        assert (code, out) == (1, "")
+        assert f"the models do not describe the protocol {name}. Remedy" in err
+
+
+def test_an_indentation_is_answered_by_jkr(capsys):
+    code, out, _ = run(capsys, "predict", "indentation", "--json")
+    answer = json.loads(out)
+    assert (code, answer["model"]) == (0, "jkr")
+    assert answer["pull_off_force_N"] == pytest.approx(1.5 * np.pi * 4.0 * 4e-3)
+    assert "F_off  0.075398 N" in run(capsys, "predict", "indentation")[1]
+    code, out, err = run(capsys, "predict", "indentation", "--plot", "p.png")
+    assert (code, out) == (2, "")
+    assert "no profile" in err
+    code, out, err = run(capsys, "sweep", "indentation", "--vary", "thickness_um=100,200")
+    assert (code, out) == (1, "")
+    assert "rig predict" in err
+
+
+def test_a_key_is_varied_once(capsys):
+    code, out, err = run(capsys, "sweep", SPHERE, "--vary", "substrate.diameter_mm=15,60", "--vary", "diameter_mm=30")
+    assert (code, out) == (2, "")
+    assert "substrate.diameter_mm is varied twice" in err
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense"])
+def test_a_scheduler_that_does_not_answer_is_named(capsys, monkeypatch, address):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("analysis.batch.ANSWER_SECONDS", 0.2)
+    code, out, err = run(capsys, "sweep", SPHERE, "--vary", "diameter_mm=30,40", "--scheduler", address)
+    assert (code, out) == (2, "")
+    assert f"scheduler {address}: no Dask scheduler answers" in err
+    assert "Remedy" in err
+
+
+def test_outputs_make_their_folders_and_bad_ones_are_refused(capsys, tmp_path):
+    table, plot = tmp_path / "new" / "t.csv", tmp_path / "other" / "p.svg"
+    assert run(capsys, "sweep", SPHERE, "--vary", "diameter_mm=30,40", "--out", table)[0] == 0
+    assert run(capsys, "predict", SPHERE, "--plot", plot)[0] == 0
+    assert len(pd.read_csv(table)) == 2
+    assert plot.read_bytes().startswith(b"<?xml")
+    for words in (["--plot", tmp_path / "p.txt"], ["--plot", tmp_path / "new" / "t.csv" / "p.png"]):
+        code, _, err = run(capsys, "predict", SPHERE, *words)
+        assert code == 2
+        assert "Remedy" in err
+    with pytest.raises(SystemExit, match="2"):
+        main(["sweep", str(SPHERE), "--vary", "diameter_mm=30,40", "--processes", "-2"])
+    assert "--processes" in capsys.readouterr().err

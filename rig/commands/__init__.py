@@ -3,5 +3,18 @@
 The modules import only argparse at the top; whatever a command needs is imported when it runs.
 """
 
+import argparse
+
 SCENE = "scene file, or the name of one that ships"
 BENCH = "bench file, or the name of one that ships"
+
+
+def count(text: str) -> int:
+    """Return the number of an option that counts something; at least one."""
+    try:
+        number = int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number}: must be at least 1")
+    return number

@@ -41,7 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Solve the film with and without its fibre layer and print the measures that converge."""
     from model.load_sharing import Fibres, Film, solve
     from rig.library import load_scene
+    from rig.output import PICTURES, prepare, writing
 
+    prepare("--plot", arguments.plot, *PICTURES)
     scene, _ = load_scene(arguments.scene)
     parameters = scene.parameters()
     film = Film.of(parameters)
@@ -53,9 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         from analysis.load_sharing_plot import draw_load_sharing
 
-        draw_load_sharing(
-            stuck, fibred, [(row["lift_m"], row["pressure_Pa"]) for row in rows], scene.title, arguments.plot
-        )
+        with writing("--plot", arguments.plot):
+            draw_load_sharing(
+                stuck, fibred, [(row["lift_m"], row["pressure_Pa"]) for row in rows], scene.title, arguments.plot
+            )
     if arguments.json:
         print(json.dumps(as_json(stuck, fibred, rows), allow_nan=False))
     else:

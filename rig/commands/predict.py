@@ -53,8 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Predict and print. A physical outcome other than pull-off is an answer; an impossible scene is an error."""
     from rig.library import load_scene
+    from rig.output import PICTURES, prepare, writing
 
     scene, _ = load_scene(arguments.scene)
+    if scene.protocol.name == "indentation":
+        return _indentation(scene, arguments)
+    prepare("--plot", arguments.plot, *PICTURES)
     prediction = predict_scene(
         scene,
         arguments.scene,
@@ -67,7 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         from analysis.prediction_plot import draw_prediction
 
-        draw_prediction(prediction, scene.title, arguments.plot)
+        with writing("--plot", arguments.plot):
+            draw_prediction(prediction, scene.title, arguments.plot)
     if arguments.json:
         print(json.dumps(as_json(prediction, profile=arguments.profile), allow_nan=False))
     else:
@@ -92,7 +97,7 @@ def predict_scene(
     FileError
         The scene is physically impossible, or the model has no choice of contact stretch.
     UnsupportedScene
-        The papers hold no adhesion model for this gripper.
+        The models do not describe this protocol, or the papers hold none for this gripper.
     """
     from dataclasses import replace
 
@@ -117,15 +122,21 @@ def predict_scene(
 
 
 def refuse_unmodelled(scene: Scene, source: str, *, rigid_bound: bool) -> str | None:
-    """Return the label a prediction of this gripper must carry, if any.
+    """Return the label a prediction of this scene must carry, if any.
 
     Raises
     ------
     UnsupportedScene
-        The papers hold no adhesion model for this gripper.
+        The models do not describe this protocol, or the papers hold none for this gripper.
     """
     from model import UnsupportedScene
 
+    protocol = scene.protocol.name
+    if protocol != "pull_off":
+        remedy = "Remedy: run it and analyse its recording."
+        if protocol == "indentation":
+            remedy = "Remedy: `rig predict` answers with JKR's pull-off force."
+        raise UnsupportedScene(f"scene {source}: the models do not describe the protocol {protocol}. {remedy}")
     kind = scene.gripper.kind
     if kind == "rigid":
         return None
@@ -138,6 +149,37 @@ def refuse_unmodelled(scene: Scene, source: str, *, rigid_bound: bool) -> str | 
     raise UnsupportedScene(
         f"scene {source}: gripper.kind = {kind!r} has no adhesion model in the papers. Remedy: {remedy}."
     )
+
+
+def _indentation(scene: Scene, arguments: argparse.Namespace) -> int:
+    """Print what JKR says of a test with a glass sphere (SI Eq. S13): a force, no profile."""
+    from model import jkr
+    from rig.errors import FileError
+    from rig.scene import IndentationSection
+
+    protocol = scene.protocol
+    assert isinstance(protocol, IndentationSection)
+    if arguments.plot is not None or arguments.profile or arguments.pressure_kpa is not None:
+        raise FileError(
+            f"scene {arguments.scene}: JKR gives the pull-off force of an indentation, no profile and no pressure. "
+            "Remedy: leave --plot, --profile and --pressure-kpa out."
+        )
+    radius, work = protocol.indenter_radius_mm * 1e-3, scene.membrane.work_of_adhesion_J_m2
+    force = jkr.pull_off_force_jkr(work, radius)
+    assumption = "half-space; on a thin bonded layer the same work gives up to twice the force"
+    if arguments.json:
+        answer = {
+            "model": "jkr",
+            "pull_off_force_N": force,
+            "work_of_adhesion_J_m2": work,
+            "indenter_radius_m": radius,
+            "assumptions": {"support": assumption},
+        }
+        print(json.dumps(answer))
+    else:
+        print(f"{scene.title}: JKR (SI Eq. S13)\n  F_off  {force:.6f} N   = 3/2 pi w R, w = {work:g} J/m^2, ", end="")
+        print(f"R = {protocol.indenter_radius_mm:g} mm\n  {assumption}")
+    return 0
 
 
 def as_json(prediction: Prediction, *, profile: bool) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rig.commands import SCENE
+from rig.commands import SCENE, count
 
 if TYPE_CHECKING:
     from rig.scene import Scene
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--model", choices=MODELS, default="cone", help="adhesion model (default: cone)")
     parser.add_argument("--out", type=Path, metavar="CSV", help="write the table here instead of standard output")
-    parser.add_argument("--processes", type=int, default=1, metavar="N", help="worker processes (default: 1)")
+    parser.add_argument("--processes", type=count, default=1, metavar="N", help="worker processes (default: 1)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786")
     parser.add_argument("--rigid-bound", action="store_true", help="soft gripper: sweep the rigid one, as a bound")
 
@@ -39,12 +39,14 @@ def run(arguments: argparse.Namespace) -> int:
     from analysis.sweep import sweep
     from rig.commands.predict import refuse_unmodelled
     from rig.library import load_scene
+    from rig.output import prepare, writing
 
+    prepare("--out", arguments.out)
     source = arguments.scene
     scene, _ = load_scene(source)
     bound = refuse_unmodelled(scene, source, rigid_bound=arguments.rigid_bound)
     axes = [parse_axis(text) for text in arguments.vary]
-    keys = [resolve(scene, key) for key, _ in axes]
+    keys = resolve_all(scene, [key for key, _ in axes])
     points = list(itertools.product(*(values for _, values in axes)))
     scenes = [changed(scene, source, dict(zip(keys, point, strict=True))) for point in points]
     table = sweep(
@@ -61,7 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         table.to_csv(sys.stdout, index=False, lineterminator="\n")
     else:
-        write(table, arguments.out)
+        with writing("--out", arguments.out):
+            table.to_csv(arguments.out, index=False, lineterminator="\n")
+        print(f"{len(table)} rows in {arguments.out}", file=sys.stderr)
     return 0
 
 
@@ -88,6 +92,24 @@ def _evenly(start: float, stop: float, count: int) -> list[float]:
     if count == 1:
         return [start]
     return [start + (stop - start) * k / (count - 1) for k in range(count - 1)] + [stop]
+
+
+def resolve_all(scene: Scene, keys: Sequence[str]) -> list[str]:
+    """Return the full keys.
+
+    Raises
+    ------
+    FileError
+        As ``resolve``; or one is given twice.
+    """
+    from rig.errors import FileError
+
+    found: list[str] = []
+    for key in keys:
+        found.append(resolve(scene, key))
+        if found[-1] in found[:-1]:
+            raise FileError(f"--vary {key}: {found[-1]} is varied twice. Remedy: give all its values in one --vary.")
+    return found
 
 
 def resolve(scene: Scene, key: str) -> str:
@@ -127,17 +149,6 @@ def changed(scene: Scene, source: str, values: dict[str, float]) -> Scene:
         section, _, name = key.partition(".")
         content[section][name] = value
     return validated(Scene, "scene", content, f"{source} with --vary")
-
-
-def write(table: Any, path: Path) -> None:
-    """Write the table, or say why not."""
-    from rig.errors import FileError
-
-    try:
-        table.to_csv(path, index=False, lineterminator="\n")
-    except OSError as error:
-        raise FileError(f"table {path}: cannot be written ({error}). Remedy: choose another --out.") from error
-    print(f"{len(table)} rows in {path}", file=sys.stderr)
 
 
 def show_progress(blocks: Iterable[Sequence[Any]], count: int) -> Iterable[Any]:
