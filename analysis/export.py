@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
+from analysis.batch import Analyzed, Source
 from analysis.errors import AnalysisError
 from analysis.numerics import Array, block_means
 from analysis.pipeline import Analysis
 from analysis.repeats import group, pooled_frame
+
+PACKAGES = ("numpy", "scipy", "matplotlib", "pandas")
 
 AFM_POINTS = 20_000
 """A curve is averaged into at most so many points for export."""
 
 
 def features_csv(analyses: Sequence[Analysis]) -> str:
-    """Return one row per run and feature: run, feature, value, uncertainty, unit, explanation.
+    """Return one row per run and feature: run, feature, value, uncertainty, unit, explanation, missing.
+
+    A feature that the run does not hold has no value; ``missing`` says why.
 
     Of several runs also one row per condition and feature: the condition in place of the run, mean, uncertainty of the
     mean, unit, and two columns of their own: standard_deviation and count (empty for single runs).
@@ -29,7 +36,11 @@ def features_csv(analyses: Sequence[Analysis]) -> str:
     for analysis in analyses:
         frame = analysis.features.frame().reset_index()
         frame.insert(0, "run", analysis.run.name)
+        frame["missing"] = ""
         frames.append(frame)
+        rows = [(analysis.run.name, *row) for row in analysis.features.missing.items()]
+        if rows:
+            frames.append(pd.DataFrame(rows, columns=["run", "feature", "missing"]))
     if len(analyses) > 1:
         names = {"condition": "run", "mean": "value", "uncertainty_of_mean": "uncertainty"}
         frames.append(pooled_frame(group(analyses)).rename(columns=names))
@@ -37,31 +48,45 @@ def features_csv(analyses: Sequence[Analysis]) -> str:
     return str(table.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
-def features_json(analyses: Sequence[Analysis]) -> dict[str, object]:
-    """Return one object: the features of a single run, or ``runs`` and ``pooled`` of several."""
-    if len(analyses) == 1:
-        return _one(analyses[0])
-    groups = group(analyses)
+def features_json(runs: Sequence[Analyzed]) -> dict[str, object]:
+    """Return ``runs``, each with its features, source and condition, and ``pooled`` by condition."""
+    groups = group(analyzed.analysis for analyzed in runs)
     pooled = pooled_frame(groups).replace({np.nan: None}).to_dict(orient="records")
+    conditions = {member.run.name: str(members.condition) for members in groups for member in members.members}
     outliers = {name: reason for members in groups for name, reason in members.outliers.items()}
     rule = groups[0].rule if groups else ""
     return {
-        "runs": [_one(analysis) for analysis in analyses],
+        "runs": [_one(analyzed, conditions[analyzed.analysis.run.name]) for analyzed in runs],
         "pooled": pooled,
         "outliers": outliers,
         "outlier_rule": rule,
+        "analysed_with": versions(),
     }
 
 
-def _one(analysis: Analysis) -> dict[str, object]:
+def versions() -> dict[str, str]:
+    """Return the versions the numbers depend on."""
+    found = {"membrane-adhesion-rig": version("membrane-adhesion-rig"), "python": platform.python_version()}
+    return found | {package: version(package) for package in PACKAGES}
+
+
+def _one(analyzed: Analyzed, condition: str) -> dict[str, object]:
+    analysis, source = analyzed.analysis, analyzed.source
     return {
         "run": analysis.run.name,
+        "condition": condition,
+        **({} if source is None else source_json(source)),
         "protocol": analysis.run.protocol,
         "complete": analysis.run.complete,
         **analysis.features.as_json(),
         "methods": analysis.work.methods,
         "decisions": dict(analysis.decisions),
     }
+
+
+def source_json(source: Source) -> dict[str, object]:
+    """Return file, SHA-256 and all that a recording says of its making."""
+    return {"path": source.path, "sha256": source.sha256, **source.metadata}
 
 
 def write_afm(analysis: Analysis, path: Path) -> None:

@@ -75,6 +75,13 @@ class Analysis:
     work: Extraction
 
     @property
+    def no_curve(self) -> str:
+        """Why there is no curve; empty where there is one."""
+        if self.curve is not None:
+            return ""
+        return self.work.failed.get("zero crossing", f"a test of the kind {self.run.protocol} has none")
+
+    @property
     def decisions(self) -> Mapping[str, str]:
         """Each step's decision in words, failures included."""
         return {

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import base64
 import html
-import platform
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from analysis.batch import Analyzed
+from analysis.export import versions
 from analysis.figures.registry import Material, picture
 from analysis.pipeline import Analysis
 from analysis.quantity import DISPLAY, Quantity, with_uncertainty
@@ -23,34 +23,55 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
-PACKAGES = ("numpy", "scipy", "matplotlib", "pandas")
+PDF_COLUMNS, PDF_LINES = 205, 70
+"""Characters in a line of the PDF's tables, and lines on a page."""
 
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """Where a run came from: file name, SHA-256 of the file, and its own metadata (scene, bench, versions)."""
-
-    name: str
-    sha256: str
-    metadata: Mapping[str, str] = field(default_factory=dict)
+EMULATED = "EMULATED: {which} from an emulated bench, not from an experiment: samples and instruments are computed."
 
 
 @dataclass
 class Report:
-    """What a report is made of; ``model`` names the prediction drawn over the curves."""
+    """What a report is made of.
+
+    Attributes
+    ----------
+    runs
+        In any order; the report shows them by condition. Their names differ.
+    model
+        Names the prediction drawn over the curves.
+    not_analysed
+        Files that are left out, and why.
+    """
 
     runs: Sequence[Analyzed]
-    sources: Sequence[Source] = ()
     model: str = "cone"
     title: str = "Pull-off tests"
+    not_analysed: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.groups: list[Group] = group(analyzed.analysis for analyzed in self.runs)
         self.material = Material(self.groups, self.model)
 
+    def by_condition(self) -> Iterator[tuple[Group, list[Analyzed]]]:
+        """Return each group with its runs."""
+        runs = {analyzed.analysis.run.name: analyzed for analyzed in self.runs}
+        for members in self.groups:
+            yield members, [runs[member.run.name] for member in members.members]
+
+    def warning(self) -> str:
+        """Say what of the data is emulated; empty where nothing is."""
+        count = sum(bool(a.source and a.source.metadata.get("emulated")) for a in self.runs)
+        if not count:
+            return ""
+        return EMULATED.format(
+            which="all data are" if count == len(self.runs) else f"{count} of {len(self.runs)} recordings are"
+        )
+
     def tables(self) -> list[Table]:
-        """Return the papers' tables, the pooled numbers and the outliers."""
-        return [*all_tables(self.groups), pooled_table(self.groups), *outlier_table(self.groups)]
+        """Return the papers' tables, the pooled numbers, the outliers and what could not be analysed."""
+        tables = [*all_tables(self.groups), pooled_table(self.groups), *outlier_table(self.groups)]
+        rows = tuple((_file_name(path), reason) for path, reason in self.not_analysed.items())
+        return [*tables, Table("Not analysed", ("File", "Why"), rows)] if rows else tables
 
     def figures(self) -> list[str]:
         """Return the numbers of the papers' figures that these recordings can fill."""
@@ -58,7 +79,7 @@ class Report:
         spheres = {m.condition.diameter for m in self.material.pull_offs() if not m.condition.flat}
         chosen += [number for number, d in (("3a", 15e-3), ("3b", 30e-3), ("3c", 60e-3)) if d in spheres]
         if len(self.material.pull_offs()) > 1:
-            chosen += ["5a", "5b", "5c"]
+            chosen += ["5a", "5b", "5c"] if spheres else ["5c"]
         if any(m.condition.protocol == "punch" for m in self.groups):
             chosen.append("3e")
         if any(m.condition.protocol == "indentation" for m in self.groups):
@@ -67,7 +88,7 @@ class Report:
 
 
 def pooled_table(groups: Sequence[Group]) -> Table:
-    """Return the main features of every condition: mean ± standard deviation (n)."""
+    """Return the main features of every condition: mean, its uncertainty, standard deviation and number of repeats."""
     features = {
         "pull_off_force_N": "F_p [N]",
         "pull_off_distance_m": "D_p [mm]",
@@ -80,9 +101,12 @@ def pooled_table(groups: Sequence[Group]) -> Table:
         "leak_rate_Pa_s": "Leak [Pa/s]",
     }
     used = {name: label for name, label in features.items() if any(m.pooled(name) for m in groups)}
-    rows = tuple((str(m.condition), *(_pooled_cell(m, name) for name in used)) for m in groups)
-    notes = ("Mean ± standard deviation (number of repeats).",)
-    return Table("Repeats by condition", ("Condition", *used.values()), rows, notes)
+    rows = tuple((str(m.condition), str(len(m.kept)), *(_pooled_cell(m, name) for name in used)) for m in groups)
+    notes = (
+        "Mean ± standard uncertainty of the mean, the sensors' calibration included, as in Tables S1 to S5.",
+        "s: standard deviation of the n repeats; a single one has its own uncertainty.",
+    )
+    return Table("Repeats by condition", ("Condition", "n", *used.values()), rows, notes)
 
 
 def _pooled_cell(members: Group, name: str) -> str:
@@ -90,7 +114,10 @@ def _pooled_cell(members: Group, name: str) -> str:
     if pooled is None:
         return "–"
     factor = DISPLAY.get(pooled.unit, ("", 1.0))[1]
-    return f"{with_uncertainty(pooled.mean * factor, pooled.deviation * factor)} ({pooled.count})"
+    mean = with_uncertainty(pooled.mean * factor, pooled.uncertainty * factor)
+    remarks = [f"s = {pooled.deviation * factor:.2g}"] if pooled.count > 1 else []
+    remarks += [f"n = {pooled.count}"] if pooled.count < len(members.kept) else []
+    return f"{mean} ({', '.join(remarks)})" if remarks else mean
 
 
 def outlier_table(groups: Sequence[Group]) -> list[Table]:
@@ -117,22 +144,17 @@ def _largest_source(quantity: Quantity) -> str:
     return f"{source} ({(part / quantity.uncertainty) ** 2:.0%})"
 
 
-def versions() -> dict[str, str]:
-    """Return the versions the numbers depend on."""
-    found = {"membrane-adhesion-rig": version("membrane-adhesion-rig"), "python": platform.python_version()}
-    return found | {package: version(package) for package in PACKAGES}
-
-
 STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;background:#fff;max-width:66rem;margin:2rem auto;padding:0
 1.2rem} h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.2rem;margin-top:2.4rem;border-bottom:1px solid #ccc}
-h3{font-size:1rem;margin:1.6rem 0 .4rem}
+h3{font-size:1.08rem;margin:2rem 0 .4rem}h4{font-size:1rem;margin:1.4rem 0 .4rem}
+.warning{border-left:4px solid #D55E00;padding:.3rem .8rem;background:#fdf1ea;font-weight:600}
 table{border-collapse:collapse;margin:.8rem 0;font-size:.84rem;display:block;overflow-x:auto}
 caption{text-align:left;font-weight:600;padding:.3rem 0}
 th,td{padding:.22rem .6rem;border-bottom:1px solid #e2e2e2;text-align:left;vertical-align:top}
 td{font-variant-numeric:tabular-nums;white-space:nowrap}details td:last-child{white-space:normal}
 thead th{border-bottom:2px solid #999;white-space:nowrap}
-tbody th{font-weight:500}.note{font-size:.8rem;color:#555;margin:.1rem 0}
+tbody th{font-weight:500;white-space:nowrap}.note{font-size:.8rem;color:#555;margin:.1rem 0}
 img{max-width:100%;height:auto}.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(24rem,1fr));gap:1rem}
 code{font-size:.8rem;word-break:break-all}details{margin:.5rem 0}summary{cursor:pointer;color:#0072B2}
 @media print{details{display:block}}
@@ -155,6 +177,11 @@ def _page(report: Report) -> Iterator[str]:
     yield f"<h1>{title}</h1><p>{count} {_plural('recording', count)}, {complete} complete, "
     conditions = len(report.groups)
     yield f"{conditions} {_plural('condition', conditions)}. Uncertainties are one standard deviation.</p>"
+    if report.warning():
+        yield f'<p class="warning">{html.escape(report.warning())}</p>'
+    if report.not_analysed:
+        left = len(report.not_analysed)
+        yield f'<p class="warning">{left} {_plural("file", left)} could not be analysed, see below.</p>'
     yield "<h2>Results</h2>"
     for table in report.tables():
         yield table.html()
@@ -166,10 +193,13 @@ def _page(report: Report) -> Iterator[str]:
             yield f"<figcaption>Figure {number}</figcaption></figure>"
         yield "</div>"
     yield "<h2>Runs</h2>"
-    for analyzed in report.runs:
-        yield from _run(analyzed)
+    for members, runs in report.by_condition():
+        yield f"<h3>{html.escape(str(members.condition))}</h3>"
+        for analyzed in runs:
+            yield from _run(analyzed)
     yield "<h2>Sources and versions</h2>"
-    yield _sources(report).html()
+    for table in _sources(report):
+        yield table.html()
     yield Table("Versions", ("Package", "Version"), tuple(versions().items())).html()
     yield "</body></html>\n"
 
@@ -186,7 +216,7 @@ def _image(data: bytes, words: str) -> str:
 def _run(analyzed: Analyzed) -> Iterator[str]:
     analysis, prediction = analyzed.analysis, analyzed.prediction
     run = analysis.run
-    yield f"<h3>{html.escape(run.name)}</h3>"
+    yield f"<h4>{html.escape(run.name)}</h4>"
     ended = "" if run.complete else " This run was aborted; what it holds is analysed."
     yield f'<p class="note">{html.escape(run.protocol)}, {analyzed.samples} samples at {analyzed.rate:g} Hz.{ended}</p>'
     yield _image(analyzed.overview, f"{run.name}: force and pressure")
@@ -221,10 +251,39 @@ def _comparison(analysis: Analysis, prediction: Prediction) -> Table:
     return Table("Measured and predicted", header, tuple(rows))
 
 
-def _sources(report: Report) -> Table:
-    keys = list(dict.fromkeys(key for source in report.sources for key in source.metadata))
-    rows = tuple((s.name, s.sha256, *(s.metadata.get(key, "") for key in keys)) for s in report.sources)
-    return Table("Recordings", ("File", "SHA-256", *keys), rows)
+def _sources(report: Report) -> list[Table]:
+    """Return where the runs came from: what all recordings say alike, then what differs, by recording."""
+    sources = [a.source for _, runs in report.by_condition() for a in runs if a.source is not None]
+    told = [{key: _words(value) for key, value in source.metadata.items()} for source in sources]
+    keys = list(dict.fromkeys(key for one in told for key in one))
+    differ = [key for key in keys if len({one.get(key) for one in told}) > 1]
+    same = tuple((_label(key), told[0][key]) for key in keys if key not in differ and told[0][key])
+    rows = tuple(
+        (source.name, *(one.get(key, "") for key in differ), source.sha256)
+        for source, one in zip(sources, told, strict=True)
+    )
+    each = Table("Recordings", ("File", *map(_label, differ), "SHA-256"), rows)
+    return [Table("Of every recording", ("", ""), same), each] if same else [each]
+
+
+def _label(key: str) -> str:
+    words = key.removesuffix("_Pa").replace("_", " ")
+    return f"{words} [Pa]" if key.endswith("_Pa") else words
+
+
+def _words(value: object) -> str:
+    """Write what a recording says of its making as a cell."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {text}" for name, text in value.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "" if value is None else str(value)
+
+
+def _file_name(path: str) -> str:
+    return Path(path).name
 
 
 def write_pdf(report: Report, path: Path) -> None:
@@ -239,24 +298,23 @@ def write_pdf(report: Report, path: Path) -> None:
 
 def _pdf_pages(report: Report, pages: PdfPages) -> None:
     from analysis.figures.registry import find
-    from analysis.figures.style import canvas
+    from analysis.figures.style import canvas, plain
 
-    sources = _sources(report)
-    lines = [report.title, "", *(line for table in [*report.tables(), sources] for line in _text_lines(table))]
+    tables = [*report.tables(), *_sources(report)]
+    lines = [report.title, report.warning(), "", *(line for table in tables for line in _text_lines(table))]
     lines += ["", *(f"{name} {number}" for name, number in versions().items())]
-    for first in range(0, len(lines), 70):
+    for first in range(0, len(lines), PDF_LINES):
         with canvas(11.7, 8.3) as figure:
             figure.set_layout_engine("none")
-            figure.text(
-                0.03, 0.97, "\n".join(lines[first : first + 70]), va="top", family="DejaVu Sans Mono", fontsize=6
-            )
+            text = plain("\n".join(lines[first : first + PDF_LINES]))
+            figure.text(0.03, 0.97, text, va="top", family="DejaVu Sans Mono", fontsize=6)
             pages.savefig(figure)  # type: ignore[no-untyped-call]
     for number in report.figures():
         chosen = find(number)
         with canvas(*chosen.size) as figure:
             chosen.draw(figure, report.material)
             pages.savefig(figure)  # type: ignore[no-untyped-call]
-    for analyzed in report.runs:
+    for analyzed in (analyzed for _, runs in report.by_condition() for analyzed in runs):
         for data in (analyzed.overview, analyzed.reasons):
             with canvas(8.3, 8.3) as figure:
                 _place(figure, data)
@@ -276,6 +334,11 @@ def _place(figure: Figure, data: bytes) -> None:
 
 def _text_lines(table: Table) -> list[str]:
     rows = [table.header, *table.rows]
-    widths = [min(44, max(len(row[i]) for row in rows)) for i in range(len(table.header))]
-    lines = ["  ".join(cell[:44].ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    return [table.title, *lines, *table.notes, ""]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(table.header))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [table.title, *(part for line in [*lines, *table.notes] for part in _folded(line)), ""]
+
+
+def _folded(line: str) -> list[str]:
+    """Cut a line into what a page is wide."""
+    return [line[:PDF_COLUMNS], *(f"    {part}" for part in wrap(line[PDF_COLUMNS:], PDF_COLUMNS - 4))]

@@ -7,15 +7,15 @@ does not spoil the new one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from rig.errors import FileError
-from rig.recording import Recording, open_recording
+from rig.measured import began
+from rig.recording import Recording
 from rig.scene import ComplianceSection, DeadWeightsSection, Section
 from sequences.calibration import WEIGH, weighing_order
 
@@ -38,11 +38,14 @@ class Calibration:
         Lines for the bench file.
     picture
         The fit.
+    numbers
+        The same as ``rows`` for programs; SI units in the names.
     """
 
     rows: tuple[tuple[str, str], ...]
     toml: str
     picture: FitPicture
+    numbers: Mapping[str, float]
 
     def __str__(self) -> str:
         table = "\n".join(f"{name:<34}{value}" for name, value in self.rows)
@@ -76,7 +79,7 @@ def dead_weights(recording: Recording) -> Calibration:
     force = recording.bench.force
     unit = "mV/V" if force.readout == "bridge" else "V"
     sign = math.copysign(1.0, fit.slope)
-    day = _began(recording).date()
+    day = began(recording).date()
     present = force.calibration
     toml = f"""\
 [force]                            # replace this key
@@ -113,6 +116,14 @@ temperature_C = {present.temperature_C}  # check: of the room
             (f"Reading [{unit}]", "Force of the weights [N]", "Residual [mN]"),
             1e3,
         ),
+        numbers={
+            f"slope_N_per_{unit.replace('/', '_')}": fit.slope,
+            "slope_relative_uncertainty": fit.relative_uncertainty,
+            "intercept_N": fit.intercept,
+            "residual_N": fit.residual,
+            "slope_against_bench_file": off,
+            "weighings": len(masses),
+        },
     )
 
 
@@ -177,6 +188,13 @@ compliance_uncertainty_um_per_N = {uncertainty * 1e6:.2g}
             ("Force [N]", "Travel while unloading [µm]", "Residual [µm]"),
             1.0,
         ),
+        numbers={
+            "compliance_m_per_N": mean,
+            "compliance_uncertainty_m_per_N": uncertainty,
+            "compliance_loading_m_per_N": down.compliance,
+            "compliance_unloading_m_per_N": up.compliance,
+            "nonlinearity_m": max(down.nonlinearity, up.nonlinearity),
+        },
     )
 
 
@@ -211,7 +229,6 @@ def pressure_zero(recording: Recording) -> Calibration:
     noise, samples = float(pressure.std(ddof=1)), pressure.size
     time = np.arange(samples) / recording.rate
     shown = running_mean(pressure, max(1, round(0.02 * recording.rate)))
-    began = _began(recording).replace(microsecond=0)
     return Calibration(
         rows=(
             ("reading at zero pressure (Pa)", f"{offset:+.2f} ± {uncertainty:.2f}"),
@@ -223,7 +240,7 @@ def pressure_zero(recording: Recording) -> Calibration:
 offset_Pa = {offset:.3f}
 noise_Pa = {noise:.3f}
 samples = {samples}
-time = {began.isoformat()}
+time = {began(recording).replace(microsecond=0).isoformat()}
 """,
         picture=_picture(
             recording,
@@ -233,6 +250,12 @@ time = {began.isoformat()}
             1.0,
             joined=True,
         ),
+        numbers={
+            "offset_Pa": offset,
+            "offset_uncertainty_Pa": uncertainty,
+            "noise_Pa": noise,
+            "samples": samples,
+        },
     )
 
 
@@ -262,11 +285,6 @@ def _section(recording: Recording, kind: type[SectionType]) -> SectionType:
     if not isinstance(protocol, kind):
         raise TypeError(f"{recording.path} is a recording of {protocol.name}")
     return protocol
-
-
-def _began(recording: Recording) -> datetime:
-    with open_recording(recording.path) as entry:
-        return datetime.fromisoformat(entry["start_time"].asstr()[()])
 
 
 def _too_short(recording: Recording, what: str) -> FileError:

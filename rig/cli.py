@@ -6,6 +6,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 COMMANDS = {
     "run": "run a scene on a bench and record it",
@@ -30,7 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code. Errors are one message on standard error."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser(words)
-    parsed = parser.parse_args(words)
+    parsed, late = parser.parse_known_args(words)
+    if late and (any(word.startswith("-") for word in late) or not hasattr(parsed, "recordings")):
+        parser.error(f"unrecognized arguments: {' '.join(late)}")
+    if late:  # files after an option that came after files
+        parsed.recordings += map(Path, late)
     try:
         return int(parsed.run(parsed))
     except KeyboardInterrupt:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,8 @@ from numpy.typing import NDArray
 
 from analysis.run import Run, Sensors
 from rig.bench import Bench
-from rig.recording import Recording, load_recording
+from rig.recording import Recording, load_recording, open_recording
+from rig.recording_file import reading
 
 
 def load_run(path: Path) -> Run:
@@ -34,6 +37,54 @@ def as_run(recording: Recording) -> Run:
         complete=recording.ending is not None and recording.ending[1] == 0,
         pump_volume=_pump_volume(recording),
     )
+
+
+def began(recording: Recording) -> datetime:
+    """Return when the run began."""
+    with open_recording(recording.path) as entry:
+        return datetime.fromisoformat(entry["start_time"].asstr()[()])
+
+
+def is_emulated(recording: Recording) -> bool:
+    """Whether the numbers come from emulated instruments, in this program or served to it."""
+    identities = recording.info.get("identities", {})
+    return recording.bench.is_emulated or any("emulated" in str(words) for words in identities.values())
+
+
+def provenance(recording: Recording) -> dict[str, object]:
+    """Return what a recording says of its making: bench, scene, calibrations, versions; SI units in the keys."""
+    with reading(recording.path):
+        return _provenance(recording)
+
+
+def _provenance(recording: Recording) -> dict[str, object]:
+    scene, bench, told = recording.scene, recording.bench, recording.configuration
+    emulated = is_emulated(recording)
+    set_point: float | None = getattr(scene.protocol, "initial_pressure_kPa", None)
+    parts: dict[str, object] = {
+        "emulated": emulated,
+        "bench": bench.title,
+        "scene": scene.title,
+        "place": told.get("place", ""),
+        "substrate": _substrate(recording),
+        "initial_pressure_set_point_Pa": None if set_point is None else set_point * 1e3,
+        "seed": int(told["seed"]) if emulated and "seed" in told else None,
+        "began": began(recording).isoformat(timespec="seconds"),
+        "force_calibration": bench.force.calibration.id,
+        "pressure_calibration": None,
+        "pressure_zero": None,
+        "recorded_with": json.loads(told.get("versions", "{}")),
+    }
+    if scene.uses_pressure and bench.pressure is not None:
+        calibration, zero = bench.pressure.calibration, bench.pressure.zero
+        parts["pressure_calibration"] = "data sheet" if calibration is None else calibration.id
+        parts["pressure_zero"] = None if zero is None else f"{zero.offset_Pa:+g} Pa, {zero.time.isoformat()}"
+    return parts
+
+
+def _substrate(recording: Recording) -> str:
+    substrate = recording.scene.substrate
+    return substrate.shape if substrate.diameter_mm is None else f"{substrate.shape} {substrate.diameter_mm:g} mm"
 
 
 def _settings(recording: Recording) -> dict[str, float | str]:

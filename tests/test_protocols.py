@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -258,5 +259,9 @@ def test_rig_analyze_gives_the_lines_too_and_refuses_to_report_them(run, capsys)
     path = run("pressure-zero", rest_s=0.5)
     assert main(["analyze", str(path)]) == 0
     assert "[pressure.zero]" in capsys.readouterr().out
-    assert main(["analyze", str(path), "--json"]) != 0
-    assert "is a calibration" in capsys.readouterr().err
+    assert main(["analyze", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    zero = tomllib.loads(told["bench_file"])["pressure"]["zero"]
+    assert told["calibration"]["offset_Pa"] == pytest.approx(zero["offset_Pa"], abs=1e-3)
+    assert main(["analyze", str(path), "--csv"]) == 2
+    assert "a calibration (pressure_zero) has no features" in capsys.readouterr().err

@@ -9,12 +9,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from analysis import Run
+from analysis import Run, analyze
+from analysis.quantity import with_uncertainty
 from analysis.synthetic import Experiment, Imperfections, Profile, pull_off_run
 from model import Gas, Parameters, Substrate, predict
 from rig.cli import main
@@ -50,7 +52,10 @@ def synthetic(name: str) -> Run:
 def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     """Files that stand for recordings; what they hold comes from ``synthetic``."""
     monkeypatch.setattr("rig.measured.load_run", lambda path: synthetic(path.stem))
-    monkeypatch.setattr("rig.recording.protocol_of", lambda path: "pull_off")
+    monkeypatch.setattr("rig.recording.load_recording", lambda path: SimpleNamespace(path=path))
+    monkeypatch.setattr("rig.measured.as_run", lambda recording: synthetic(recording.path.stem))
+    monkeypatch.setattr("rig.calibrate.calibrate", lambda recording: None)
+    monkeypatch.setattr("rig.measured.provenance", lambda recording: {"bench": "none"})
     paths = [tmp_path / f"{name}.h5" for name in ("first", "second", "aborted")]
     for path in paths:
         path.write_bytes(path.stem.encode())
@@ -111,10 +116,14 @@ def test_csv_and_words(files: list[str], capsys: pytest.CaptureFixture[str]) -> 
 
     assert main(["analyze", files[0], "--csv"]) == 0
     table = pd.read_csv(io.StringIO(capsys.readouterr().out))
-    assert {"run", "feature", "value", "uncertainty", "unit", "explanation"} == set(table.columns)
+    assert {"run", "feature", "value", "uncertainty", "unit", "explanation", "missing"} == set(table.columns)
     assert main(["analyze", *files, "--csv"]) == 0
     table = pd.read_csv(io.StringIO(capsys.readouterr().out))
     force = table[table["feature"] == "pull_off_force_N"]
+    gap = force[force["run"] == "aborted"].iloc[0]
+    assert np.isnan(gap["value"])
+    assert "no retraction" in gap["missing"]
+    force = force[force["value"].notna()]
     pooled, single = force[force["count"].notna()].iloc[0], force[force["count"].isna()]
     assert list(single["run"]) == ["first", "second"]
     assert pooled["count"] == 2
@@ -129,18 +138,20 @@ def test_csv_and_words(files: list[str], capsys: pytest.CaptureFixture[str]) -> 
     assert "Table S1" in capsys.readouterr().out
 
 
-def test_curves_of_runs_and_their_mean(files: list[str], tmp_path: Path) -> None:
-    assert main(["analyze", *files, "--curves", str(tmp_path / "curves")]) == 0
+def test_curves_of_runs_and_their_mean(files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["analyze", *files, "--curves", str(tmp_path / "curves")]) == 1
+    assert "no curve: aborted: the run has no retraction" in capsys.readouterr().err
     names = sorted(path.name for path in (tmp_path / "curves").iterdir())
     assert names == ["first.csv", "mean-1.csv", "second.csv"]
     mean = pd.read_csv(tmp_path / "curves" / "mean-1.csv")
     assert mean["force_N"].min() == pytest.approx(-predict(SCENE).pull_off_force, rel=0.02)
 
 
-def test_afmformats_opens_the_export(files: list[str], tmp_path: Path) -> None:
+def test_afmformats_opens_the_export(files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import afmformats
 
-    assert main(["analyze", files[0], "--afm", str(tmp_path)]) == 0
+    assert main(["analyze", files[0], files[2], "--afm", str(tmp_path)]) == 1
+    assert "no .tab: aborted: no approach or no retraction" in capsys.readouterr().err
     (curve,) = afmformats.load_data(tmp_path / "first.tab")
     assert curve.modality == "force-distance"
     assert curve.retr["force"].min() == pytest.approx(-predict(SCENE).pull_off_force, rel=0.02)
@@ -167,3 +178,25 @@ def test_figure_command_writes_picture_and_data(
     assert "choose one of" in capsys.readouterr().err
     assert main(["figure", "list"]) == 0
     assert "S8" in capsys.readouterr().out
+
+
+def test_repeats_state_uncertainty_and_deviation() -> None:
+    from analysis.repeats import group
+    from analysis.report import pooled_table
+
+    runs = [analyze(synthetic(name)) for name in ("first", "second")]
+    both, alone = (pooled_table(group(runs[:count])) for count in (2, 1))
+    pooled = group(runs)[0].pooled("initial_pressure_Pa")
+    assert pooled is not None
+    place = both.header.index("P_0 [kPa]")
+    mean = with_uncertainty(pooled.mean * 1e-3, pooled.uncertainty * 1e-3)
+    assert both.rows[0][1:2] == ("2",)
+    assert both.rows[0][place] == f"{mean} (s = {pooled.deviation * 1e-3:.2g})"
+    assert alone.rows[0][place] == str(runs[0].features["initial_pressure_Pa"]).removesuffix(" kPa")
+
+
+def test_runs_stand_under_their_condition(files: list[str], tmp_path: Path) -> None:
+    page = tmp_path / "out.html"
+    assert main(["analyze", files[2], *files[:2], "--report", str(page)]) == 0
+    runs = page.read_text(encoding="utf-8").partition("<h2>Runs</h2>")[2]
+    assert re.findall("<h[34]>(.*?)</h[34]>", runs) == ["d_b 60 mm, P_0 = -1.0 kPa", "aborted", "first", "second"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.chamber import BoyleFit, Leak
-from analysis.figures.style import BLUE, GREY, ORANGE, canvas, save, thin
+from analysis.figures.style import BLUE, GREY, ORANGE, canvas, plain, save, thin
 from analysis.numerics import Array, block_means, running_mean
 from analysis.pipeline import Analysis
 from analysis.run import Run
@@ -55,7 +55,7 @@ def draw_fit(figure: Figure, content: FitPicture) -> None:
     order = np.argsort(content.x, kind="stable")
     above.plot(*_shown(content, content.y), color=BLUE, label="measured", **style)
     above.plot(content.x[order], content.line[order], color=ORANGE, linewidth=1.1, label="fit")
-    above.set_title(content.title, loc="left")
+    above.set_title(plain(content.title), loc="left")
     above.set_ylabel(content.y_label)
     above.legend(loc="best", title=content.result)
     residual = np.asarray((content.y - content.line) * content.residual_scale, dtype=np.float64)

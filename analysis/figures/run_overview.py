@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.figures.style import BLACK, BLUE, GREY, ORANGE, canvas, encode, save, thin
+from analysis.figures.style import BLACK, BLUE, GREY, ORANGE, canvas, encode, plain, save, thin
 from analysis.numerics import Array, running_mean
 from analysis.pipeline import Analysis
 from analysis.run import Run
@@ -92,7 +92,7 @@ def _smooth(values: Array, rate: float) -> Array:
 
 def draw_against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
     """Draw force and pressure of a whole run against time, with the six moments of EML Fig. 2."""
-    axes.set_title(run.name, loc="left", pad=18)  # above the words of the six moments
+    axes.set_title(plain(run.name), loc="left", pad=18)  # above the words of the six moments
     axes.plot(*thin(run.time, analysis.force), color=BLUE, linewidth=1.0)
     _force_axis(axes)
     axes.set_xlabel("Time t [s]")

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from rig.commands import count
 
 if TYPE_CHECKING:
     from analysis.batch import Analyzed
-    from analysis.report import Source
-    from rig.areas import Areas
+    from rig.collection import Collection
+
+FOR_FEATURES = ("csv", "tables", "report", "pdf", "curves", "afm")
+"""Options that ask for what a calibration recording does not hold."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     from model import MODELS
 
-    parser.add_argument("recordings", nargs="*", type=Path, metavar="FILE", help="recordings (.h5)")
+    parser.add_argument(
+        "recordings", nargs="*", type=Path, metavar="FILE", help="recordings (.h5), or folders of recordings"
+    )
     output = parser.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print one JSON object")
     output.add_argument("--csv", action="store_true", help="print the features as CSV, one row each")
@@ -35,92 +39,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--areas", type=Path, metavar="CSV", help="contact areas by recording (rig contact-area)")
     parser.add_argument("--model", choices=MODELS, default="cone", help="model drawn over the data")
     parser.add_argument("--title", default="Pull-off tests", help="title of the report")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--jobs", type=count, metavar="N", help="processes (default: one per core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on instead")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse and print or write what was asked for."""
+    """Analyse and print or write what was asked for; 1 where something had to be left out, 2 where everything had."""
+    from rig.areas import read_areas, strangers
+    from rig.collection import collect, own_names
+    from rig.errors import FileError
+    from rig.output import prepare, prepare_folder
+
     if arguments.published:
         return _published(as_json=arguments.json)
     if not arguments.recordings:
-        from rig.errors import FileError
-
-        raise FileError("no recording given. Remedy: name one or more .h5 files, or use --published")
-    if _calibrations(arguments):
-        return 0
-    wants_pictures = arguments.report is not None or arguments.pdf is not None
-    runs = analyze_files(
+        raise FileError("no recording given. Remedy: name .h5 files or their folder, or use --published")
+    prepare("--report", arguments.report, ".html", ".htm")
+    prepare("--pdf", arguments.pdf, ".pdf")
+    prepare_folder("--curves", arguments.curves)
+    prepare_folder("--afm", arguments.afm)
+    areas = {} if arguments.areas is None else read_areas(arguments.areas)
+    found = collect(
         arguments.recordings,
         model=arguments.model,
-        pictures=wants_pictures,
+        pictures=arguments.report is not None or arguments.pdf is not None,
         jobs=arguments.jobs,
         scheduler=arguments.scheduler,
-        areas=_areas(arguments),
+        areas=areas,
     )
-    _write(arguments, runs)
-    _print(arguments, runs)
-    return 0
-
-
-def _areas(arguments: argparse.Namespace) -> Areas:
-    """Read the areas file; say which of its recordings are not analysed."""
-    from rig.areas import read_areas, strangers
-
-    if arguments.areas is None:
-        return {}
-    areas = read_areas(arguments.areas)
-    for name in strangers(areas, (path.stem for path in arguments.recordings)):
+    for name in strangers(areas, own_names(found.files)):
         print(f"rig analyze: {arguments.areas}: {name} is not among the recordings", file=sys.stderr)
-    return areas
-
-
-def _calibrations(arguments: argparse.Namespace) -> bool:
-    """Print what calibration recordings give; return whether there was nothing else to analyse."""
-    from rig.calibrate import PROTOCOLS, calibrate
-    from rig.errors import FileError
-    from rig.recording import load_recording, protocol_of
-
-    found = [path for path in arguments.recordings if protocol_of(path) in PROTOCOLS]
-    if not found:
-        return False
-    options = ("json", "csv", "tables", "report", "pdf", "curves", "afm")
-    if any(getattr(arguments, name) for name in options):
-        raise FileError(f"{found[0]}: is a calibration, it has no features. Remedy: analyse it alone, without options.")
-    for path in found:
-        print(f"{path}\n{calibrate(load_recording(path))}")
-    arguments.recordings = [path for path in arguments.recordings if path not in found]
-    return not arguments.recordings
-
-
-def analyze_files(
-    paths: list[Path],
-    *,
-    model: str = "cone",
-    pictures: bool = False,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    areas: Areas | None = None,
-) -> list[Analyzed]:
-    """Analyse recordings, with progress on standard error; on several processes where there are more than three."""
-    from tqdm import tqdm
-
-    from analysis.batch import on_all_cores
-
-    workers = 1 if jobs is None and len(paths) <= 3 else jobs
-    function = partial(analyze_file, model=model, pictures=pictures, areas=areas)
-    outcomes = on_all_cores(function, paths, workers=workers, scheduler=scheduler)
-    quiet = len(paths) < 2 or not sys.stderr.isatty()
-    return list(tqdm(outcomes, total=len(paths), unit="run", disable=quiet))
-
-
-def analyze_file(path: Path, *, model: str = "cone", pictures: bool = False, areas: Areas | None = None) -> Analyzed:
-    """Analyse one recording, with the contact areas measured for it since."""
-    from analysis.batch import analyze_run
-    from rig.areas import with_area
-    from rig.measured import load_run
-
-    return analyze_run(with_area(load_run(path), areas or {}), model=model, pictures=pictures)
+    if any(getattr(arguments, name) for name in FOR_FEATURES):
+        found.leave_calibrations()
+    unwritten = _write(arguments, found) if found.runs else []
+    _print(arguments, found)
+    found.tell()
+    for line in unwritten:
+        print(line, file=sys.stderr)
+    return found.exit_code or int(bool(unwritten))
 
 
 def _published(*, as_json: bool) -> int:
@@ -145,46 +101,49 @@ def _published(*, as_json: bool) -> int:
     return 0
 
 
-def _write(arguments: argparse.Namespace, runs: list[Analyzed]) -> None:
+def _write(arguments: argparse.Namespace, found: Collection) -> list[str]:
+    """Write the files asked for; return what could not be written, a line each."""
+    from rig.output import writing
+
     if arguments.report is not None or arguments.pdf is not None:
         from analysis.report import Report, write_html, write_pdf
 
-        report = Report(runs, [source(path) for path in arguments.recordings], arguments.model, arguments.title)
-        for path, write in ((arguments.report, write_html), (arguments.pdf, write_pdf)):
+        report = Report(found.runs, arguments.model, arguments.title, found.left)
+        for option, path, write in (
+            ("--report", arguments.report, write_html),
+            ("--pdf", arguments.pdf, write_pdf),
+        ):
             if path is not None:
-                write(report, path)
+                with writing(option, path):
+                    write(report, path)
                 print(f"report     {path}", file=sys.stderr)
+    unwritten = []
     if arguments.curves is not None:
-        _write_curves(arguments.curves, runs)
+        with writing("--curves", arguments.curves):
+            unwritten += _write_curves(arguments.curves, found.runs)
     if arguments.afm is not None:
-        _write_afm(arguments.afm, arguments.recordings)
+        with writing("--afm", arguments.afm):
+            unwritten += _write_afm(arguments.afm, found.runs)
+    return unwritten
 
 
-def source(path: Path) -> Source:
-    """Return name and SHA-256 of a recording."""
-    from analysis.report import Source
-
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return Source(path.name, digest.hexdigest())
-
-
-def _write_curves(directory: Path, runs: list[Analyzed]) -> None:
+def _write_curves(directory: Path, runs: list[Analyzed]) -> list[str]:
     from analysis.repeats import band, group
 
-    directory.mkdir(parents=True, exist_ok=True)
+    unwritten = []
     for analyzed in runs:
-        curve = analyzed.analysis.curve
-        if curve is not None:
-            _csv(curve.frame(), directory / f"{analyzed.analysis.run.name}.csv")
+        curve, name = analyzed.analysis.curve, analyzed.analysis.run.name
+        if curve is None:
+            unwritten.append(f"no curve: {name}: {analyzed.analysis.no_curve}")
+        else:
+            _csv(curve.frame(), directory / f"{name}.csv")
     for number, members in enumerate(group(analyzed.analysis for analyzed in runs), start=1):
         mean = band(members)
         if mean is not None and mean.count > 1:
             frame = mean.frame()
             frame.insert(0, "condition", str(members.condition))
             _csv(frame, directory / f"mean-{number}.csv")
+    return unwritten
 
 
 def _csv(frame: object, path: Path) -> None:
@@ -194,33 +153,78 @@ def _csv(frame: object, path: Path) -> None:
     path.write_text(frame.to_csv(index=False, float_format="%.9g", lineterminator="\n"), encoding="utf-8", newline="\n")
 
 
-def _write_afm(directory: Path, paths: list[Path]) -> None:
-    from analysis import analyze
+def _write_afm(directory: Path, runs: list[Analyzed]) -> list[str]:
+    """Write every run in its full resolution, which the analysis of many has let go."""
+    from dataclasses import replace
+
+    from analysis import AnalysisError, analyze
     from analysis.export import write_afm
     from rig.measured import load_run
 
-    directory.mkdir(parents=True, exist_ok=True)
-    for path in paths:
-        write_afm(analyze(load_run(path), uncertainties=False), directory / f"{path.stem}.tab")
+    unwritten = []
+    for analyzed in runs:
+        name, source = analyzed.analysis.run.name, analyzed.source
+        assert source is not None
+        try:
+            whole = analyze(replace(load_run(Path(source.path)), name=name), uncertainties=False)
+            write_afm(whole, directory / f"{name}.tab")
+        except AnalysisError as error:
+            unwritten.append(f"no .tab: {error}")
+    return unwritten
 
 
-def _print(arguments: argparse.Namespace, runs: list[Analyzed]) -> None:
-    from analysis.export import features_csv, features_json
+def _print(arguments: argparse.Namespace, found: Collection) -> None:
+    from analysis.export import features_csv
 
-    analyses = [analyzed.analysis for analyzed in runs]
+    analyses = [analyzed.analysis for analyzed in found.runs]
     if arguments.json:
-        print(json.dumps(features_json(analyses), ensure_ascii=False))
-    elif arguments.csv:
+        print(json.dumps(as_json(found), ensure_ascii=False))
+    elif arguments.csv and analyses:
         print(features_csv(analyses), end="")
-    elif arguments.tables:
+    elif arguments.tables and analyses:
         from analysis.repeats import group
         from analysis.tables import all_tables
 
         print("\n".join(table.markdown() for table in all_tables(group(analyses))))
-    elif arguments.report is None and arguments.pdf is None and arguments.curves is None and arguments.afm is None:
-        for analysis in analyses:
-            print(f"{analysis.run.name}  ({analysis.run.protocol}{'' if analysis.run.complete else ', aborted'})")
-            for name, quantity in analysis.features.items():
-                print(f"  {name:32s} {quantity!s:>26s}   {quantity.explanation}")
-            for name, reason in analysis.features.missing.items():
-                print(f"  {name:32s} {'–':>26s}   missing: {reason}")
+    elif not any(getattr(arguments, name) for name in FOR_FEATURES):
+        for calibrated in found.calibrations:
+            print(f"{calibrated.source.path}\n{calibrated.calibration}")
+        for analyzed in found.runs:
+            _print_words(analyzed)
+
+
+def as_json(found: Collection) -> dict[str, Any]:
+    """Return the object of ``--json``: of one recording its features, of several ``runs`` and what they have in common.
+
+    A calibration has ``calibration`` in place of the features.
+    """
+    from analysis.export import features_json, source_json
+
+    calibrations = [
+        {
+            "run": Path(calibrated.source.name).stem,
+            "protocol": calibrated.protocol,
+            **source_json(calibrated.source),
+            "calibration": dict(calibrated.calibration.numbers),
+            "bench_file": calibrated.calibration.toml,
+        }
+        for calibrated in found.calibrations
+    ]
+    left = [{"file": name, "reason": reason} for name, reason in found.left.items()]
+    several = features_json(found.runs)
+    runs = several["runs"]
+    assert isinstance(runs, list)
+    if len(found.files) == 1 and len(runs) + len(calibrations) == 1:
+        return {**[*runs, *calibrations][0], "analysed_with": several["analysed_with"], "not_analysed": left}
+    return {**several, "calibrations": calibrations, "not_analysed": left}
+
+
+def _print_words(analyzed: Analyzed) -> None:
+    analysis, source = analyzed.analysis, analyzed.source
+    emulated = source is not None and source.metadata.get("emulated")
+    words = [analysis.run.protocol, *["EMULATED"] * bool(emulated), *["aborted"] * (not analysis.run.complete)]
+    print(f"{analysis.run.name}  ({', '.join(words)})")
+    for name, quantity in analysis.features.items():
+        print(f"  {name:32s} {quantity!s:>26s}   {quantity.explanation}")
+    for name, reason in analysis.features.missing.items():
+        print(f"  {name:32s} {'–':>26s}   missing: {reason}")
