@@ -12,6 +12,7 @@ import pytest
 from drivers.emulated.faults import Fault, Faults
 from drivers.errors import NotConnected
 from rig.bench import parse_bench
+from rig.emulation import truth
 from rig.errors import FileError, Refused
 from rig.measured import load_run
 from rig.observe import Controls, StepPhase, Watcher
@@ -207,6 +208,21 @@ def test_a_run_that_needs_hands_asks_first_and_replays(request_for):
     asked = [row["text"].decode() for row in recording.events if row["kind"] == b"prompt"]
     assert asked[0] == "Bring the probe over center, then go on"
     assert replay(recording, pace=Pace()).differences == ()
+
+
+def test_a_pressure_that_does_not_follow_the_pump_ends_the_run_after_one_stroke(request_for, monkeypatch):
+    def vented(scene, seed):
+        world = truth(scene, seed)
+        return dataclasses.replace(world, chamber=dataclasses.replace(world.chamber, vented=True))
+
+    monkeypatch.setattr("rig.emulation.truth", vented)
+    request = request_for("sphere-60mm-low")
+    ending = run_scene(request)
+    assert ending.exit_code == 4
+    assert "stroke should make -3.2" in ending.reason
+    assert "close the vent" in ending.reason
+    strokes = [row for row in load_recording(request.out).events if b"dispense" in row["text"]]
+    assert len(strokes) == 1
 
 
 def test_an_observer_that_fails_harms_nothing(request_for):
