@@ -37,7 +37,7 @@ def random_run(number: int, folder, *, wire: bool) -> None:
         update={
             "preload_N": draw.uniform(0.05, 0.5),
             "approach_speed_um_s": draw.uniform(50, 100) if wire else draw.uniform(100, 250),
-            "retract_speed_um_s": draw.uniform(150, 450),
+            "retract_speed_um_s": draw.uniform(100, 250),
             "initial_pressure_kPa": draw.uniform(-4, 4),
         }
     )
