@@ -62,7 +62,7 @@ class Collection:
     def leave_calibrations(self) -> None:
         """Leave calibrations out: features and curves are asked for, and they hold none."""
         for one in self.calibrations:
-            self.left[one.source.path] = (
+            self.left[str(Path(one.source.path))] = (
                 f"a calibration ({one.protocol}) has no features. Remedy: analyse it without options, or with --json."
             )
         self.calibrations.clear()

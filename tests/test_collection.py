@@ -90,6 +90,18 @@ def test_nothing_to_analyse_is_an_error_and_writes_nothing(
     assert not (tmp_path / "r.html").exists()
 
 
+def test_an_error_nobody_has_thought_of_is_named(
+    made: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*words: object, **options: object) -> None:
+        raise ZeroDivisionError("float division")
+
+    monkeypatch.setattr("analysis.batch.analyze_run", fail)
+    code, _, err = analyze(capsys, made / "first.h5")
+    assert code == 2
+    assert "first.h5: the analysis failed (ZeroDivisionError: float division). Remedy: report it" in err
+
+
 def test_a_folder_stands_for_its_recordings(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("first", "second", "text"):
         shutil.copy(made / f"{name}.h5", tmp_path)
@@ -127,6 +139,11 @@ def test_equal_names_are_told_apart(made: Path, tmp_path: Path, capsys: pytest.C
     assert code == 0
     assert {"one-run", "two-run"} < {line.partition(",")[0] for line in out.splitlines()}
     assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["mean-1.csv", "one-run.csv", "two-run.csv"]
+    areas = tmp_path / "areas.csv"
+    areas.write_text("recording,area_mm2\none-run,0.8\nrun,0.9\n")
+    _, _, err = analyze(capsys, tmp_path / "one", tmp_path / "two", "--csv", "--areas", areas)
+    assert "run is not among the recordings" in err
+    assert "one-run is not" not in err
 
 
 @pytest.mark.parametrize(
@@ -177,11 +194,11 @@ def test_a_report_of_recordings_is_the_same_twice(
 def test_a_name_that_looks_like_a_formula_is_shown_as_it_is(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    odd = tmp_path / r"$\frac{1}$.h5"
+    odd = tmp_path / "$x^{1$.h5"
     shutil.copy(made / "first.h5", odd)
     code, _, _ = analyze(capsys, odd, "--report", tmp_path / "r.html", "--pdf", tmp_path / "r.pdf")
     assert code == 0
-    assert r"$\frac{1}$" in (tmp_path / "r.html").read_text("utf-8")
+    assert "$x^{1$" in (tmp_path / "r.html").read_text("utf-8")
 
 
 def test_calibrations_have_a_form_for_programs(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

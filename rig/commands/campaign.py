@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rig.commands import BENCH
+from rig.commands import BENCH, count
 
 if TYPE_CHECKING:
     from rig.bench import Bench
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bench", type=Path, help=f"{BENCH}; without one everything is emulated")
     parser.add_argument("--out", type=Path, help="folder of the recordings (default: recordings/<campaign>)")
     parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
-    parser.add_argument("--jobs", type=int, default=1, help="emulated bench: tests at the same time")
+    parser.add_argument("--jobs", type=count, default=1, help="emulated bench: tests at the same time")
     parser.add_argument("--yes", action="store_true", help="do not wait for the operator's hands")
     parser.add_argument("--report", type=Path, metavar="HTML", help="analyse the whole campaign into one page")
 
@@ -38,7 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     from rig.campaign import Journal, load_campaign
     from rig.check import check
     from rig.errors import FileError
+    from rig.output import prepare
 
+    prepare("--report", arguments.report, ".html", ".htm")
     campaign, tests = load_campaign(arguments.file)
     bench, bench_text = load_bench(arguments.bench)
     if arguments.jobs > 1 and not bench.is_emulated:
