@@ -260,7 +260,8 @@ def _grubbs(named: Sequence[tuple[str, Quantity]]) -> dict[str, str]:
 class Band:
     """Mean and standard deviation of the curves of a group on one grid of z_r: the shaded areas of the papers.
 
-    All arrays have the length of ``retraction``; pressures are ``None`` where a repeat has none.
+    All arrays have the length of ``retraction``; pressures are ``None`` where a repeat has none. The mean of several
+    ends where the first of them detaches.
     """
 
     retraction: Array
@@ -281,20 +282,27 @@ class Band:
         }
         if self.pressure is not None and self.pressure_deviation is not None:
             columns |= {"pressure_Pa": self.pressure, "pressure_standard_deviation_Pa": self.pressure_deviation}
+        columns["repeats_in_contact"] = np.full(self.retraction.size, float(self.count))
         return pd.DataFrame(columns)
 
 
 def band(members: Group, points: int = 400) -> Band | None:
     """Average the curves of a group on ``points`` values of z_r common to all; ``None`` where none has a curve.
 
-    The grid runs from where the last of the curves begins to where the first ends. Each curve is averaged within the
-    cells of the grid first, so that noise does not enter the deviation.
+    The grid runs from where the last of the curves begins to where the first detaches: beyond it a mean over repeats
+    that hold and repeats that do not is none of them. A single curve runs to its end. Each curve is averaged within
+    the cells of the grid first, so that noise does not enter the deviation.
     """
-    curves = [member.curve for member in members.kept if member.curve is not None]
+    drawn = [member for member in members.kept if member.curve is not None]
+    curves = [member.curve for member in drawn if member.curve is not None]
     if not curves:
         return None
     start = max(float(curve.retraction[:16].mean()) for curve in curves)
     stop = min(float(curve.retraction.max()) for curve in curves)
+    if len(curves) > 1:
+        detached = [member.features.value("pull_off_distance_m") for member in drawn]
+        first = min((place for place in detached if np.isfinite(place)), default=stop)
+        stop = min(stop, first - (first - start) / (2 * points))  # half a cell, so that no cell holds a snap
     if stop <= start:
         return None
     grid = np.linspace(start, stop, points)

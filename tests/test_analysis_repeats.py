@@ -46,6 +46,22 @@ def test_band_is_mean_and_standard_deviation_on_a_common_grid() -> None:
     assert np.all(np.diff(mean.retraction) > 0)
 
 
+def test_the_mean_of_repeats_ends_where_the_first_detaches() -> None:
+    runs = []
+    for seed, distance in enumerate((1.2e-3, 1.3e-3)):
+        run, _ = pull_off_run(shape(0.5, distance), FAST, Imperfections(force_noise=3e-4), seed=seed, parameters=SCENE)
+        runs.append(analyze(run, uncertainties=False))
+    first = min(run.features.value("pull_off_distance_m") for run in runs)
+    mean = band(group(runs)[0])
+    assert mean is not None
+    assert first - 10e-6 < mean.retraction[-1] < first
+    assert mean.force[-1] + mean.force_deviation[-1] < -0.1
+    assert set(mean.frame()["repeats_in_contact"]) == {2.0}
+    alone = band(group(runs[:1])[0])
+    assert alone is not None
+    assert alone.retraction[-1] > first + 0.1e-3
+
+
 def test_band_without_pressure_has_none() -> None:
     without = [analyze(replace(made_run(0.5, seed), pressure=None), uncertainties=False) for seed in range(2)]
     mean = band(group(without)[0])

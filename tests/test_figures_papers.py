@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis import AnalysisError, Run, analyze
+from analysis import AnalysisError, Run, Sensors, analyze
 from analysis.figures import overview
 from analysis.figures.registry import Material, draw, find, load, picture
 from analysis.figures.run_overview import markers, overview_bytes
@@ -100,6 +100,74 @@ def test_5f_shows_the_maxima_of_the_model(tmp_path: Path) -> None:
     assert best["diameter_m"] * 1e3 == pytest.approx(33, abs=2)
     drop = 1 - high["pull_off_distance_m"].iloc[-1] / best["pull_off_distance_m"]
     assert drop == pytest.approx(0.11, abs=0.02)
+
+
+@pytest.mark.parametrize(("number", "distance"), [("6h", 1.59e-3), ("6i", 1.26e-3)])
+def test_disks_let_go_at_one_height_above_them(number: str, distance: float, tmp_path: Path) -> None:
+    """EML 2020: D_p = 1.59 and 1.26 mm for all sizes of the disk, counted from z = 0."""
+    data = pd.read_csv(draw(number, Material(), tmp_path / "figure.png"))
+    ends = data.groupby("series")["position_m"].max()
+    assert len(ends) == 8
+    assert ends.max() - ends.min() < 2e-6
+    assert ends.max() == pytest.approx(distance, abs=0.02e-3)
+
+
+def test_the_example_without_recordings_names_its_anchor_and_snaps_to_zero(tmp_path: Path) -> None:
+    data = pd.read_csv(draw("2a", Material(), tmp_path / "figure.png"))
+    assert set(data["series"]) == {"60 mm, P_0 = -3.2 kPa at V_0"}
+    assert data["pressure_Pa"].iloc[0] > -2000
+    with canvas() as figure:
+        find("2a").draw(figure, Material())
+        assert np.asarray(figure.axes[0].get_lines()[0].get_ydata())[-1] == 0.0
+
+
+def test_s9_draws_every_position(tmp_path: Path) -> None:
+    profile = Profile.jkr(4.1, 4e-3, 2e6, 0.095)
+    runs = []
+    for seed, place in enumerate(("top", "left")):
+        test = replace(FAST, preload=0.1, approach_stiffness=20000.0, retract_speed=10e-6)
+        test = replace(test, settings={"indenter_radius_mm": 4.0, "position": place})
+        run, _ = pull_off_run(profile, test, Imperfections(force_noise=1e-4), seed=seed)
+        runs.append(replace(run, protocol="indentation", pressure=None))
+    data = pd.read_csv(draw("S9", Material(group(analyze(run) for run in runs)), tmp_path / "figure.png"))
+    assert data[data["source"] == "measured"]["series"].nunique() == 2
+    assert {"model JKR", "model DMT", "model Maugis"} <= set(data["source"])
+
+
+def test_the_line_of_the_tare_lies_on_the_force_it_was_fitted_to() -> None:
+    from analysis.figures.reasons import draw_reasons
+
+    profile = Profile.of(predict(scene(60e-3, 1000.0), points=1500))
+    flaws = Imperfections(force_noise=1e-4, creep=0.06, drift=2e-5)
+    sensors = Sensors(creep=0.06, creep_time=9.0)
+    run, _ = pull_off_run(profile, FAST, flaws, parameters=scene(60e-3, 1000.0), sensors=sensors)
+    with canvas() as figure:
+        draw_reasons(figure, analyze(run, uncertainties=False))
+        *_, after, line = figure.axes[0].get_lines()
+        time, shown = (np.asarray(values, dtype=np.float64) for values in after.get_data())
+        assert np.abs(shown - np.interp(time, *line.get_data())).max() < 0.7
+
+
+def test_small_forces_and_ways_are_written_in_small_units() -> None:
+    from analysis.figures.run_overview import Scale
+    from analysis.quantity import Quantity
+
+    assert Scale.of_force(np.array([0.0, -1.6e-3])).write(Quantity(1.619e-3, 2.9e-5, "N")) == "1.619 ± 0.029 mN"
+    assert Scale.of_force(np.array([-1.0])).unit == "N"
+    assert Scale.of_length(2.9e-6).unit == "µm"
+
+
+def test_the_measured_pressure_fills_its_axis() -> None:
+    from analysis.figures.run_overview import draw_overview
+
+    run = recorded(scene(15e-3, 1000.0))
+    assert run.pressure is not None
+    analysis = analyze(run, uncertainties=False)
+    with canvas() as figure:
+        draw_overview(figure, run, analysis, predict(scene(15e-3, 9000.0)))
+        low, high = figure.axes[-1].get_ylim()
+        seen = 1e-3 * float(np.ptp(run.pressure[slice(*analysis.work.retraction())]))
+        assert high - low < 2.2 * seen
 
 
 def test_same_material_same_bytes() -> None:

@@ -9,23 +9,25 @@ import numpy as np
 
 from analysis.errors import AnalysisError
 from analysis.figures.parts import (
+    BAND,
     Series,
     draw_band,
     draw_model,
     frame_profile,
     kilopascal,
+    named,
     profile_axes,
     scene,
     shades,
 )
 from analysis.figures.registry import Material, paper_figure
-from analysis.figures.run_overview import draw_against_time
+from analysis.figures.run_overview import draw_against_time, force_axis, pressure_axis
 from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, MARKERS, ORANGE, PURPLE, plain
 from analysis.indentation import fit_contact, indenter_radius
 from analysis.numerics import running_mean
 from analysis.pipeline import Analysis
 from analysis.published import experiments
-from analysis.repeats import Group
+from analysis.repeats import Condition, Group
 from model import jkr
 from model.parameters import Gripper, Membrane, Parameters
 
@@ -33,6 +35,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+EXAMPLE = "60 mm sphere, $P_0$ = -3.2 kPa at $V_0$; contact makes the volume smaller"
+EXAMPLE_NAME = "60 mm, P_0 = -3.2 kPa at V_0"
+"""The example without recordings; the gas law is anchored before contact, so P_a begins above P_0."""
 
 RETRACT_SPEED = 10e-6
 """EML 2020 section 2, m/s: turns a predicted profile into one against time."""
@@ -83,16 +89,13 @@ def figure_2a(figure: Figure, material: Material) -> pd.DataFrame:
     prediction = material.predict(scene(60e-3, -3.2e3))
     stable = prediction.stable
     time = (prediction.position[stable] - prediction.position[stable][0]) / RETRACT_SPEED
-    axes.plot(time, prediction.force[stable], "--", color=BLUE, label=r"$F_r$ model")
-    axes.set_xlabel("Time since the start of the retraction [s]")
-    axes.set_ylabel(r"Reaction force $F_r$ [N]", color=BLUE)
-    twin = axes.twinx()
-    twin.plot(time, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
-    twin.set_ylabel(r"Air pressure $P_a$ [kPa]", color=ORANGE)
-    twin.grid(visible=False)
-    axes.set_title("60 mm sphere, model: retraction at 10 µm/s", loc="left")
+    axes.plot(np.append(time, time[-1]), np.append(prediction.force[stable], 0.0), "--", color=BLUE)
+    axes.set_xlabel("Time since the start of the retraction at 10 µm/s [s]")
+    force_axis(axes)
+    pressure_axis(axes).plot(time, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
+    axes.set_title(f"Model: {EXAMPLE}", loc="left")
     series.add(
-        "60 mm, -3.2 kPa",
+        EXAMPLE_NAME,
         f"model {prediction.model}",
         time_s=time,
         force_N=prediction.force[stable],
@@ -116,26 +119,24 @@ def figure_2b(figure: Figure, material: Material) -> pd.DataFrame:
     """Draw mean and standard deviation of F_r and P_a over the repeats of one condition."""
     axes, series = figure.subplots(), Series()
     example = _example(material)
-    twin = axes.twinx()
-    twin.grid(visible=False)
-    twin.set_ylabel(r"Air pressure $P_a$ [kPa]", color=ORANGE)
     profile_axes(axes)
+    force_axis(axes)
+    twin = pressure_axis(axes)
     if example is None:
         prediction = material.predict(scene(60e-3, -3.2e3))
-        draw_model(axes, prediction, BLUE, "60 mm, -3.2 kPa", series)
+        draw_model(axes, prediction, BLUE, EXAMPLE_NAME, series)
         stable = prediction.stable
         twin.plot(prediction.retraction[stable] * 1e3, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
-        axes.set_title("60 mm sphere, model", loc="left")
-    else:
-        mean = draw_band(axes, example, BLUE, str(example.condition), series)
-        if mean is not None and mean.pressure is not None and mean.pressure_deviation is not None:
-            shown = mean.retraction <= axes.get_xlim()[1] * 1e-3
-            place, gas, spread = (v[shown] for v in (mean.retraction * 1e3, mean.pressure, mean.pressure_deviation))
-            twin.plot(place, gas * 1e-3, color=ORANGE)
-            twin.fill_between(
-                place, (gas - spread) * 1e-3, (gas + spread) * 1e-3, color=ORANGE, alpha=0.25, linewidth=0
-            )
-        axes.set_title(f"{example.condition}; {len(example.kept)} repeats, bands ± 1 standard deviation", loc="left")
+        axes.set_title(f"Model: {EXAMPLE}", loc="left", fontsize=9)
+        return series.frame()
+    mean = draw_band(axes, example, BLUE, str(example.condition), series)
+    if mean is not None and mean.pressure is not None and mean.pressure_deviation is not None:
+        shown = mean.retraction <= axes.get_xlim()[1] * 1e-3
+        place, gas, spread = (v[shown] for v in (mean.retraction * 1e3, mean.pressure, mean.pressure_deviation))
+        twin.plot(place, gas * 1e-3, color=ORANGE)
+        twin.fill_between(place, (gas - spread) * 1e-3, (gas + spread) * 1e-3, color=ORANGE, alpha=0.25, linewidth=0)
+    title = f"{named(example.condition)}; {len(example.kept)} repeats"
+    axes.set_title(f"{title}\n{BAND}" if len(example.kept) > 1 else title, loc="left", fontsize=9)
     return series.frame()
 
 
@@ -147,7 +148,9 @@ def _by_pressure(figure: Figure, material: Material, diameter: float) -> pd.Data
             gas = "vented" if members.condition.pressure is None else kilopascal(members.condition.pressure)
             label = ", ".join(filter(None, (gas, members.condition.distinction)))
             draw_band(axes, members, color, label, series)
-        axes.set_title(f"$d_b$ = {diameter * 1e3:g} mm", loc="left")
+        words = f"$d_b$ = {diameter * 1e3:g} mm"
+        repeated = any(len(members.kept) > 1 for members in groups)
+        axes.set_title(f"{words}\n{BAND}" if repeated else words, loc="left", fontsize=9)
     else:
         scenes = _published_scenes(diameter)
         for (pressure, parameters), color in zip(scenes, shades(len(scenes)), strict=True):
@@ -207,7 +210,7 @@ def _spheres(figure: Figure, material: Material, *, highest: bool, with_model: b
     if not material.pull_offs():
         axes.set_title("model (no recordings)", loc="left")
     elif with_model:
-        axes.set_title("solid: experiment, dashed: model", loc="left")
+        axes.set_title(f"solid: experiment, dashed: model\n{BAND}", loc="left", fontsize=9)
     return series.frame()
 
 
@@ -279,6 +282,7 @@ def figure_5c(figure: Figure, material: Material) -> pd.DataFrame:
             axes.plot(pressures * 1e-3, forces, "--", color=color, label=None if groups else label)
             series.add(label, f"model {material.model}", initial_pressure_Pa=pressures, pull_off_force_N=forces)
     axes.plot([], [], "o", color=BLACK, markerfacecolor="none", label="published, Table S1")
+    axes.plot([], [], "--", color=BLACK, label=f"model ({material.model})")
     axes.set_xlabel("Initial pressure $P_0$ [kPa]")
     axes.set_ylabel("Pull-off force $F_p$ [N]")
     axes.set_ylim(bottom=0)
@@ -345,8 +349,8 @@ def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
     for axes, gripper, work, letter in zip(panels, ("soft", "rigid"), (3.3, 4.1), "AB", strict=True):
         found = [m for m in material.groups if m.condition.protocol == "indentation" and m.condition.gripper == gripper]
         if found:
-            _draw_indentation(axes, found[0].kept[0], series)
-            axes.set_title(f"{letter}  {gripper} system, {plain(found[0].condition.place)}", loc="left")
+            _draw_indentations(axes, [members.kept[0] for members in found], series)
+            axes.set_title(f"{letter}  {gripper} system", loc="left")
         else:
             curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=JKR_CONTACT)
             last = curve.indentation[-1] * 1e3
@@ -359,22 +363,44 @@ def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
     return series.frame()
 
 
-def _draw_indentation(axes: Axes, analysis: Analysis, series: Series) -> None:
+def _draw_indentations(axes: Axes, analyses: Sequence[Analysis], series: Series) -> None:
+    """Draw every position, and over the one nearest to the mean force the fitted models."""
+    forces = np.array([analysis.features.value("pull_off_force_N") for analysis in analyses])
+    middle = int(np.nanargmin(np.abs(forces - np.nanmean(forces)))) if np.isfinite(forces).any() else 0
+    ends: list[tuple[float, float]] = []
+    for number, (analysis, color) in enumerate(zip(analyses, shades(len(analyses)), strict=True)):
+        work = analysis.work
+        origin = _origin(analysis)
+        width = max(1, work.force.size // 4000)
+        force, depth = running_mean(work.force, width)[::width], origin - work.separation[::width]
+        place = plain(Condition.of(analysis.run).place or analysis.run.name)
+        axes.plot(depth * 1e3, force * 1e3, label=place, color=color, linewidth=1.6 if number == middle else 0.8)
+        series.add(analysis.run.name, "measured", [analysis], displacement_m=depth, force_N=force)
+        if "detachment" in work.details:
+            ends.append((float(depth.max()) * 1e3, (origin - work.release_separation) * 1e3))
+    if ends:
+        deepest, last = max(end for end, _ in ends), min(end for _, end in ends)
+        axes.set_xlim(min(2.0 * last, -0.5 * deepest), 1.1 * deepest)
+    if "detachment" in analyses[middle].work.details:
+        _draw_fits(axes, analyses[middle], series)
+    axes.legend(fontsize=7)
+
+
+def _origin(analysis: Analysis) -> float:
+    """Return the separation at contact, or where the approach shows none that at the zero of force, m."""
+    features = analysis.features
+    return features.value("contact_height_m" if "contact_height_m" in features else "zero_force_height_m")
+
+
+def _draw_fits(axes: Axes, analysis: Analysis, series: Series) -> None:
     work = analysis.work
     start, _ = work.retraction()
-    origin = analysis.features.value("contact_height_m")
-    width = max(1, work.force.size // 4000)
-    force, depth = running_mean(work.force, width)[::width], origin - work.separation[::width]
-    axes.plot(depth * 1e3, force * 1e3, color=BLUE, label="measured")
-    series.add(analysis.run.name, "measured", [analysis], displacement_m=depth, force_N=force)
-    if "detachment" not in work.details:
-        return
-    deepest, last = float(depth.max()) * 1e3, (origin - work.release_separation) * 1e3
-    axes.set_xlim(min(2.0 * last, -0.5 * deepest), 1.1 * deepest)
+    origin = _origin(analysis)
     part = slice(start, int(work.release))
     fits = fit_contact(work.separation[part], work.force[part], indenter_radius(analysis.run))
+    place = plain(Condition.of(analysis.run).place)
     for fit, color, style in zip(fits, (ORANGE, GREEN, PURPLE), ("--", ":", "-."), strict=True):
-        label = f"{fit.model}: {fit.work_of_adhesion:.2f} J/m²"
+        label = f"{fit.model} ({place}): {fit.work_of_adhesion:.2f} J/m²"
         axes.plot((origin - fit.separation) * 1e3, fit.force * 1e3, style, color=color, label=label)
         series.add(
             f"{analysis.run.name} {fit.model}",
@@ -382,4 +408,3 @@ def _draw_indentation(axes: Axes, analysis: Analysis, series: Series) -> None:
             displacement_m=origin - fit.separation,
             force_N=fit.force,
         )
-    axes.legend()

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.figures.style import GREY
+from analysis.figures.style import GREY, plain
 from analysis.numerics import Array
-from analysis.repeats import Band, Group, band
+from analysis.repeats import Band, Condition, Group, band
 from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
 
 if TYPE_CHECKING:
@@ -76,8 +76,15 @@ def profile_axes(axes: Axes) -> None:
     axes.axhline(0, color=GREY, linewidth=0.7, zorder=1)
 
 
+BAND = "± 1 standard deviation up to the first detachment; bar: $D_p$"
+"""What ``draw_band`` shows of several repeats."""
+
+
 def draw_band(axes: Axes, members: Group, color: str, label: str, series: Series) -> Band | None:
-    """Draw the mean of a group's curves with its standard deviation shaded, up to a little beyond detachment."""
+    """Draw the mean of a group's curves with its standard deviation shaded, and D_p with its own as a bar.
+
+    A single curve is drawn to a little beyond its detachment.
+    """
     mean = band(members)
     if mean is None:
         return None
@@ -86,29 +93,50 @@ def draw_band(axes: Axes, members: Group, color: str, label: str, series: Series
     shown = mean.retraction <= last
     place, force, spread = (values[shown] for values in (mean.retraction, mean.force, mean.force_deviation))
     axes.plot(place * 1e3, force, color=color, label=label)
-    axes.fill_between(place * 1e3, force - spread, force + spread, color=color, alpha=0.25, linewidth=0)
     columns = {"retraction_m": place, "force_N": force, "force_standard_deviation_N": spread}
     if mean.pressure is not None:
         columns["pressure_Pa"] = mean.pressure[shown]
-    series.add(label, "measured", members.kept, **columns)
+    if mean.count == 1:
+        series.add(label, "measured", members.kept, **columns)
+        return mean
+    axes.fill_between(place * 1e3, force - spread, force + spread, color=color, alpha=0.25, linewidth=0)
+    if pooled is not None:
+        axes.errorbar(pooled.mean * 1e3, 0.0, xerr=pooled.deviation * 1e3, fmt="|", color=color, capsize=2)
+    count = np.full(place.size, float(mean.count))
+    series.add(label, "measured", members.kept, **columns, repeats_in_contact=count)
     return mean
 
 
+def named(condition: Condition) -> str:
+    """Return a condition with its symbols set as symbols."""
+    return plain(condition).replace("d_b ", "$d_b$ = ").replace("P_0", "$P_0$")
+
+
 def draw_model(
-    axes: Axes, prediction: Prediction, color: str, label: str, series: Series, *, style: str = "--", name: str = ""
+    axes: Axes,
+    prediction: Prediction,
+    color: str,
+    label: str,
+    series: Series,
+    *,
+    style: str = "--",
+    name: str = "",
+    from_zero: bool = False,
 ) -> None:
-    """Draw a predicted profile up to detachment and its drop to zero."""
+    """Draw a predicted profile up to detachment and its drop to zero, against z_r, or ``from_zero`` against z."""
     stable = prediction.stable
     if not stable.any():
         return
     place, force = prediction.retraction[stable], prediction.force[stable]
     order = np.argsort(place, kind="stable")
     place, force = place[order], force[order]
-    axes.plot(np.append(place, place[-1]) * 1e3, np.append(force, 0.0), style, color=color, label=label or None)
+    position = prediction.position[stable][order]
+    shown = position if from_zero else place
+    axes.plot(np.append(shown, shown[-1]) * 1e3, np.append(force, 0.0), style, color=color, label=label or None)
     series.add(
         name or label,
         f"model {prediction.model}",
-        retraction_m=place,
+        **({"position_m": position} if from_zero else {"retraction_m": place}),
         force_N=force,
         pressure_Pa=prediction.pressure[stable][order],
         contact_radius_m=prediction.contact_radius[stable][order],

@@ -41,20 +41,19 @@ def _title(axes: Axes, step: str, decision: object) -> None:
 
 
 def _tare(axes: Axes, analysis: Analysis) -> None:
-    run, details = analysis.run, analysis.work.details["tare"]
-    baseline = analysis.work.baseline
+    run, work = analysis.run, analysis.work
+    details, baseline = work.details["tare"], work.baseline
     center = float(baseline(0.0))
-    axes.plot(*thin(run.time, (run.force - center) * 1e3), color=GREY, linewidth=0.6)
+    line = baseline(np.arange(run.force.size, dtype=np.float64)) - center
+    fitted = (work.force + line) * 1e3  # what the line was fitted to: with creep put back
+    axes.plot(*thin(run.time, fitted), color=GREY, linewidth=0.6)
     windows = details["windows"]
     assert isinstance(windows, list)
     for start, stop in windows:
-        part = slice(start, stop)
-        axes.plot(*thin(run.time[part], (run.force[part] - center) * 1e3, 500), color=BLUE, linewidth=0.8)
-    ends = np.array([0.0, run.force.size - 1.0])
-    axes.plot(ends / run.rate, (baseline(ends) - center) * 1e3, color=ORANGE)
-    noise = 1e3 * analysis.work.noise.sigma
-    drift = 1e3 * abs(float(baseline(ends[1]) - baseline(ends[0])))
-    axes.set_ylim(-8 * noise - drift, 8 * noise + drift)
+        axes.plot(*thin(run.time[start:stop], fitted[start:stop], 500), color=BLUE, linewidth=0.8)
+    axes.plot(run.time[[0, -1]], line[[0, -1]] * 1e3, color=ORANGE)
+    noise = 1e3 * work.noise.sigma
+    axes.set_ylim(1e3 * float(line.min()) - 8 * noise, 1e3 * float(line.max()) + 8 * noise)
     _title(axes, "Tare", details["decision"])
     axes.set_xlabel("Time [s]")
     axes.set_ylabel("Force minus tare [mN]")
@@ -64,8 +63,10 @@ def _contact(axes: Axes, analysis: Analysis) -> None:
     details = analysis.work.details["contact"]
     separation, force = np.asarray(details["separation"]), np.asarray(details["force"])
     origin = analysis.features.value("contact_height_m")
-    shown = force < 0.3 * force.max()
-    axes.plot((separation[shown] - origin) * 1e6, force[shown] * 1e3, ".", color=GREY, markersize=2)
+    near = 1e6 * max(20 * analysis.features.value("contact_spread_m"), 0.01 * float(np.ptp(separation)))
+    place = (separation - origin) * 1e6
+    shown = (force < 0.3 * force.max()) & (np.abs(place) < near)
+    axes.plot(place[shown], force[shown] * 1e3, ".", color=GREY, markersize=2)
     methods = details["methods"]
     assert isinstance(methods, dict)
     for (name, place), color in zip(methods.items(), CYCLE, strict=False):
@@ -74,9 +75,10 @@ def _contact(axes: Axes, analysis: Analysis) -> None:
         )
     axes.axvline(0, color=BLACK, linestyle=":", linewidth=1.2)
     _title(axes, "Contact", details["decision"])
+    axes.set_xlim(-near, near)
     axes.set_xlabel("Separation from contact [µm]")
     axes.set_ylabel("Force [mN]")
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, frameon=True, framealpha=1.0, edgecolor="none")
 
 
 def _peak(axes: Axes, analysis: Analysis) -> None:

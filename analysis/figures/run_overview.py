@@ -2,28 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from analysis.figures.style import BLACK, BLUE, GREY, ORANGE, canvas, encode, plain, save, thin
 from analysis.numerics import Array, running_mean
 from analysis.pipeline import Analysis
+from analysis.quantity import Quantity, with_uncertainty
 from analysis.run import Run
 from model.prediction import Prediction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 
 OFFSETS = {1: (-9, 8), 2: (-9, 6), 3: (0, -15), 4: (10, 8), 5: (0, -14), 6: (-10, 8)}
 """Where each number stands beside its point, in points, so that moments close in time stay legible."""
 
 
-LABEL = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
-"""Keeps a label legible over a line."""
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """A unit that a figure writes its numbers in: its name and how many of it make one SI unit."""
+
+    unit: str
+    factor: float
+
+    @classmethod
+    def of_force(cls, force: Array) -> Self:
+        """Return N, or mN where no force reaches 0.2 N."""
+        return cls("N", 1.0) if float(np.abs(force).max(initial=0.0)) > 0.2 else cls("mN", 1e3)
+
+    @classmethod
+    def of_length(cls, length: float) -> Self:
+        """Return mm, or µm below 0.1 mm."""
+        return cls("mm", 1e3) if length >= 1e-4 else cls("µm", 1e6)
+
+    def write(self, quantity: Quantity) -> str:
+        """Return a quantity with its uncertainty in this unit."""
+        return f"{with_uncertainty(quantity.value * self.factor, quantity.uncertainty * self.factor)} {self.unit}"
 
 
 def overview(run: Run, analysis: Analysis, prediction: Prediction | None, path: Path) -> None:
@@ -72,13 +93,15 @@ def draw_overview(figure: Figure, run: Run, analysis: Analysis, prediction: Pred
         _against_retraction(below, run, analysis, prediction)
 
 
-def _force_axis(axes: Axes) -> None:
-    axes.set_ylabel(r"Reaction force $F_r$ [N]", color=BLUE)
+def force_axis(axes: Axes, unit: str = "N") -> None:
+    """Colour the axis of the force and draw its zero."""
+    axes.set_ylabel(rf"Reaction force $F_r$ [{unit}]", color=BLUE)
     axes.tick_params(axis="y", colors=BLUE)
     axes.axhline(0, color=GREY, linewidth=0.7, zorder=1)
 
 
-def _pressure_axis(axes: Axes) -> Axes:
+def pressure_axis(axes: Axes) -> Axes:
+    """Return a second axis for the pressure."""
     twin = axes.twinx()
     twin.set_ylabel(r"Air pressure $P_a$ [kPa]", color=ORANGE)
     twin.tick_params(axis="y", colors=ORANGE)
@@ -93,20 +116,22 @@ def _smooth(values: Array, rate: float) -> Array:
 def draw_against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
     """Draw force and pressure of a whole run against time, with the six moments of EML Fig. 2."""
     axes.set_title(plain(run.name), loc="left", pad=18)  # above the words of the six moments
-    axes.plot(*thin(run.time, analysis.force), color=BLUE, linewidth=1.0)
-    _force_axis(axes)
+    scale = Scale.of_force(analysis.force)
+    force = analysis.force * scale.factor
+    axes.plot(*thin(run.time, force), color=BLUE, linewidth=1.0)
+    force_axis(axes, scale.unit)
     axes.set_xlabel("Time t [s]")
     axes.margins(x=0.01, y=0.16)
     if run.pressure is not None:
         pressure = _smooth(run.pressure, run.rate) * 1e-3
-        _pressure_axis(axes).plot(*thin(run.time, pressure), color=ORANGE, linewidth=1.0)
+        pressure_axis(axes).plot(*thin(run.time, pressure), color=ORANGE, linewidth=1.0)
     places = markers(run, analysis)
     for number, (index, name) in places.items():
         del name
-        axes.plot(index / run.rate, analysis.force[int(index)], "o", color=BLACK, markersize=3, zorder=5)
+        axes.plot(index / run.rate, force[int(index)], "o", color=BLACK, markersize=3, zorder=5)
         axes.annotate(
             str(number),
-            (index / run.rate, analysis.force[int(index)]),
+            (index / run.rate, force[int(index)]),
             xytext=OFFSETS[number],
             textcoords="offset points",
             ha="center",
@@ -141,72 +166,91 @@ def markers(run: Run, analysis: Analysis) -> dict[int, tuple[float, str]]:
 def _against_retraction(axes: Axes, run: Run, analysis: Analysis, prediction: Prediction | None) -> None:
     curve = analysis.curve
     assert curve is not None
-    lines = axes.plot(*thin(curve.retraction * 1e3, curve.force), color=BLUE, label=r"$F_r$ measured")
-    _force_axis(axes)
-    axes.set_xlabel(r"Retraction $z_r$ [mm]")
-    twin = None
+    window = _window(analysis, prediction)
+    newton, metre = Scale.of_force(curve.force), Scale.of_length(window[1])
+    place = curve.retraction * metre.factor
+    lines = axes.plot(*thin(place, curve.force * newton.factor), color=BLUE, label=r"$F_r$ measured")
+    force_axis(axes, newton.unit)
+    axes.set_xlabel(rf"Retraction $z_r$ [{metre.unit}]")
+    twin, gas = None, None
     if curve.pressure is not None:
-        twin = _pressure_axis(axes)
-        smooth = _smooth(curve.pressure, run.rate) * 1e-3
-        lines += twin.plot(*thin(curve.retraction * 1e3, smooth), color=ORANGE, label=r"$P_a$ measured")
+        twin, gas = pressure_axis(axes), _smooth(curve.pressure, run.rate) * 1e-3
+        lines += twin.plot(*thin(place, gas), color=ORANGE, label=r"$P_a$ measured")
     if prediction is not None and prediction.retraction.size:
         stable = prediction.stable
-        place = prediction.retraction[stable] * 1e3
+        predicted = prediction.retraction[stable] * metre.factor
         label = rf"$F_r$ model ({prediction.model})"
-        force = np.append(prediction.force[stable], 0.0)
-        lines += axes.plot(np.append(place, place[-1]), force, "--", color=BLACK, linewidth=1.2, label=label)
+        force = np.append(prediction.force[stable], 0.0) * newton.factor
+        drop = np.append(predicted, predicted[-1])
+        lines += axes.plot(drop, force, "--", color=BLACK, linewidth=1.2, label=label)
         if twin is not None:
             label = f"$P_a$ model{ANCHORED.get(prediction.assumptions.get('gas anchor', ''), '')}"
-            lines += twin.plot(place, prediction.pressure[stable] * 1e-3, ":", color=BLACK, linewidth=1.4, label=label)
-    _limits(axes, analysis, prediction)
-    _annotate(axes, twin or axes, analysis)
-    axes.legend(handles=lines, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(lines))
+            model_gas = prediction.pressure[stable] * 1e-3
+            lines += twin.plot(predicted, model_gas, ":", color=BLACK, linewidth=1.4, label=label)
+    _limits(axes, analysis, prediction, window, newton, metre)
+    if twin is not None and gas is not None:
+        _pressure_limits(twin, gas[(curve.retraction >= window[0]) & (curve.retraction <= window[1])])
+    lines += _marks(axes, analysis, newton, metre)
+    axes.legend(handles=lines, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
 
 
-def _limits(axes: Axes, analysis: Analysis, prediction: Prediction | None) -> None:
-    curve = analysis.curve
+def _window(analysis: Analysis, prediction: Prediction | None) -> tuple[float, float]:
+    """Return where the picture begins and ends, m: with the way the load train springs back at detachment."""
+    curve, work = analysis.curve, analysis.work
     assert curve is not None
     last = analysis.features.value("pull_off_distance_m")
-    last = float(curve.retraction.max()) if np.isnan(last) else last
+    if np.isnan(last):
+        last = float(curve.retraction.max())
+    else:
+        after = int(work.release) - work.retraction()[0]
+        last = max(last, float(curve.retraction[after : after + work.samples(0.02)].max(initial=last)))
     if prediction is not None and np.isfinite(prediction.pull_off_distance):
         last = max(last, prediction.pull_off_distance)
-    first = max(float(curve.retraction.min()), -0.35 * last)
-    axes.set_xlim((first - 0.03 * last) * 1e3, 1.22 * last * 1e3)
+    return max(float(curve.retraction.min()), -0.35 * last), last
+
+
+def _limits(
+    axes: Axes,
+    analysis: Analysis,
+    prediction: Prediction | None,
+    window: tuple[float, float],
+    newton: Scale,
+    metre: Scale,
+) -> None:
+    curve = analysis.curve
+    assert curve is not None
+    first, last = window
+    axes.set_xlim((first - 0.03 * last) * metre.factor, 1.15 * last * metre.factor)
     seen = curve.force[curve.retraction >= first]
     low, high = float(seen.min()), float(seen.max())
     if prediction is not None and np.isfinite(prediction.pull_off_force):
         low = min(low, -prediction.pull_off_force)
-    axes.set_ylim(low - 0.16 * (high - low), high + 0.08 * (high - low))
+    margin = 0.08 * (high - low)
+    axes.set_ylim((low - margin) * newton.factor, (high + margin) * newton.factor)
 
 
-def _annotate(axes: Axes, foremost: Axes, analysis: Analysis) -> None:
-    """Mark F_p and D_p on the force; the words stand on the foremost axes, above every curve."""
+def _pressure_limits(axes: Axes, measured: Array) -> None:
+    """The measured pressure fills the axis; the model's may widen it by half on either side, and is cut off beyond."""
+    if not measured.size:
+        return
+    low, high = float(measured.min()), float(measured.max())
+    span = max(high - low, 0.1)
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(max(bottom, low - 0.5 * span), min(top, high + 0.5 * span))
+
+
+def _marks(axes: Axes, analysis: Analysis, newton: Scale, metre: Scale) -> list[Line2D]:
+    """Mark F_p and D_p on the curve; their values stand in the legend, where they hide nothing."""
     features = analysis.features
+    drawn: list[Line2D] = []
     if "pull_off_force_N" in features:
-        force, place = features.value("pull_off_force_N"), features.value("retraction_at_pull_off_m") * 1e3
-        axes.plot(place, -force, "v", color=BLACK, markersize=6, zorder=6)
-        foremost.annotate(
-            rf"$F_p$ = {features['pull_off_force_N']}",
-            (place, -force),
-            xytext=(0, -9),
-            xycoords=axes.transData,
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=8,
-            bbox=LABEL,
-        )
+        place, force = features.value("retraction_at_pull_off_m"), features["pull_off_force_N"]
+        label = f"$F_p$ = {newton.write(force)}"
+        at = (place * metre.factor, -force.value * newton.factor)
+        drawn += axes.plot(*at, "v", color=BLACK, markersize=6, zorder=6, label=label)
     if "pull_off_distance_m" in features:
-        distance = features.value("pull_off_distance_m") * 1e3
-        axes.plot(distance, 0, "|", color=BLACK, markersize=10, zorder=6)
-        foremost.annotate(
-            rf"$D_p$ = {features['pull_off_distance_m']}",
-            (distance, 0),
-            xytext=(-4, 5),
-            xycoords=axes.transData,
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            fontsize=8,
-            bbox=LABEL,
-        )
+        distance = features["pull_off_distance_m"]
+        label = f"$D_p$ = {metre.write(distance)}"
+        at = (distance.value * metre.factor, 0.0)
+        drawn += axes.plot(*at, "|", color=BLACK, markersize=10, zorder=6, label=label)
+    return drawn

@@ -19,7 +19,7 @@ from analysis.figures.parts import (
     shades,
 )
 from analysis.figures.registry import Material, paper_figure
-from analysis.figures.style import BLUE, MARKERS, ORANGE
+from analysis.figures.style import BLUE, GREY, MARKERS, ORANGE
 from model.parameters import Gripper, Parameters
 from model.prediction import Outcome, Prediction
 
@@ -45,14 +45,14 @@ def _profiles(
     scenes: Sequence[tuple[str, Parameters]],
     *,
     legend: str,
-    model: str | None = None,
+    from_zero: bool = False,
 ) -> tuple[pd.DataFrame, Axes]:
     axes = figure.subplots()
     series = Series()
     for (label, parameters), color in zip(scenes, shades(len(scenes)), strict=True):
-        prediction = material.predict(parameters, model)
+        prediction = material.predict(parameters)
         label_shown = label if prediction.stable.any() else ""
-        draw_model(axes, prediction, color, label_shown, series, style="-", name=label)
+        draw_model(axes, prediction, color, label_shown, series, style="-", name=label, from_zero=from_zero)
     profile_axes(axes)
     frame_profile(axes)
     axes.legend(title=legend, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -83,27 +83,20 @@ def figure_5f(figure: Figure, material: Material) -> pd.DataFrame:
     """Draw D_p against d_b at P_0 = +1 and -1 kPa, with the maxima marked."""
     axes, series = figure.subplots(), Series()
     diameters = np.concatenate([np.arange(8.0, 45.0, 1.0), np.arange(45.0, 61.0, 2.5)]) * 1e-3
-    for pressure, color, marker in ((1e3, BLUE, "o"), (-1e3, ORANGE, "s")):
+    for pressure, color, marker, published in ((1e3, BLUE, "o", "8 %"), (-1e3, ORANGE, "s", "26 %")):
         distances = np.array([_distance(material.predict(scene(float(d), pressure))) for d in diameters])
         label = f"$P_0$ = {kilopascal(pressure)}"
-        axes.plot(diameters * 1e3, distances * 1e3, "-", color=color, label=label)
         if np.isfinite(distances).any():
             best = int(np.nanargmax(distances))
             axes.plot(diameters[best] * 1e3, distances[best] * 1e3, marker, color=color)
-            words = f"max. at {diameters[best] * 1e3:.0f} mm, {1 - distances[-1] / distances[best]:.0%} less at 60 mm"
-            below = pressure > 0
-            axes.annotate(
-                words,
-                (diameters[best] * 1e3, distances[best] * 1e3),
-                xytext=(4, -14 if below else 6),
-                textcoords="offset points",
-                fontsize=7.5,
-            )
+            drop = 100 * (1 - distances[-1] / distances[best])
+            label += f": max. at {diameters[best] * 1e3:.0f} mm, {drop:.0f} % less at 60 mm"
+        axes.plot(diameters * 1e3, distances * 1e3, "-", color=color, label=f"{label} (EML: 32 mm, {published})")
         series.add(kilopascal(pressure), f"model {material.model}", diameter_m=diameters, pull_off_distance_m=distances)
+    axes.axvline(32, color=GREY, linestyle=":", linewidth=1.0, label="maximum in EML 2020")
     axes.set_xlabel("Sphere diameter $d_b$ [mm]")
     axes.set_ylabel("Pull-off distance $D_p$ [mm]")
-    axes.margins(y=0.12)
-    axes.legend()
+    axes.legend(loc="lower right", fontsize=7, frameon=True, framealpha=1.0, edgecolor="none")
     return series.frame()
 
 
@@ -207,20 +200,24 @@ def figure_6g(figure: Figure, material: Material) -> pd.DataFrame:
 def _disks(figure: Figure, material: Material, pressure: float) -> pd.DataFrame:
     diameters = np.arange(8, 16) * 1e-3
     scenes = [(f"{d * 1e3:g} mm", scene(float(d), pressure, flat=True)) for d in diameters]
-    data, axes = _profiles(figure, material, scenes, legend="$d_b$ (disk)")
+    data, axes = _profiles(figure, material, scenes, legend="$d_b$ (disk)", from_zero=True)
+    axes.set_xlabel("Retraction from $z$ = 0 [mm]")
     axes.set_title(f"$P_0$ = {kilopascal(pressure)}", loc="left")
     return data
 
 
 @paper_figure("6h", "EML 6h: model profiles on flat disks, P_0 = +1 kPa")
 def figure_6h(figure: Figure, material: Material) -> pd.DataFrame:
-    """Draw F_r against z_r for flat disks of 8 to 15 mm diameter; 15 mm is wider than the contact can be."""
+    """Draw F_r against z for flat disks of 8 to 15 mm diameter; 15 mm is wider than the contact can be.
+
+    Here the paper counts D_p from z = 0, not from the zero of the force: it is the same for every disk.
+    """
     return _disks(figure, material, 1e3)
 
 
 @paper_figure("6i", "EML 6i: model profiles on flat disks, P_0 = -1 kPa")
 def figure_6i(figure: Figure, material: Material) -> pd.DataFrame:
-    """Draw F_r against z_r for flat disks of 8 to 15 mm diameter."""
+    """Draw F_r against z for flat disks of 8 to 15 mm diameter."""
     return _disks(figure, material, -1e3)
 
 
@@ -245,5 +242,6 @@ def figure_s8(figure: Figure, material: Material) -> pd.DataFrame:
     for axes in (whole, begin):
         profile_axes(axes)
     whole.legend(title="$r_e$", loc="upper right", bbox_to_anchor=(0.95, 0.95))
-    begin.set_title("beginning, $r_e$ = 8 mm", loc="left")
+    whole.set_title("A", loc="left")
+    begin.set_title("B  beginning, $r_e$ = 8 mm", loc="left")
     return series.frame()
