@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from drivers.interfaces import Pump, Stage
+from rig.bench import Bench
 from rig.scene import (
     ComplianceSection,
     ContactSection,
@@ -15,7 +17,12 @@ from rig.scene import (
 from sequences import calibration, chamber
 from sequences.pressurize import Chamber
 from sequences.pull_off import PullOff, PullOffSettings
-from sequences.step import Apparatus, Step, by_hand
+from sequences.step import Apparatus, Step, Teller, by_hand
+
+
+def apparatus_of(bench: Bench, stage: Stage, pump: Pump | None, tell: Teller) -> Apparatus:
+    """Return what the steps act on, with the bench's look-ahead and frames."""
+    return Apparatus(stage, pump, tell, bench.limits.look_ahead_um * 1e-6, bench.daq.frame_s)
 
 
 def build_steps(scene: Scene, apparatus: Apparatus, hands: str = "") -> list[Step]:

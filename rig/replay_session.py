@@ -15,14 +15,14 @@ from rig.instruments import sensor_converter
 from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
 from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
-from rig.protocols import build_steps
+from rig.protocols import apparatus_of, build_steps
 from rig.recording import Recording
 from rig.replay import EndOfRecording, Pace, ReplayedControls, ReplayedDaq, ReplayedPump, ReplayedStage, Verification
 from rig.safe_state import make_safe
 from rig.scene import Scene, Section
 from rig.validation import validated
 from sequences.errors import StepFailed
-from sequences.step import Apparatus, play
+from sequences.step import play
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def replay(
     verification = Verification(recording)
     reporter.store = verification
     bench = recording.bench
-    apparatus = Apparatus(instruments.stage, instruments.pump, reporter, bench.limits.look_ahead_um * 1e-6)
+    apparatus = apparatus_of(bench, instruments.stage, instruments.pump, reporter)
     steps = build_steps(recording.scene, apparatus, recording.configuration.get("hands", ""))
     if live and (what_if is not None or len(recording.predictions)):
         reporter.add(_live(recording, reporter, what_if))

@@ -26,14 +26,14 @@ from rig.instruments import Opened, open_instruments
 from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
 from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
-from rig.protocols import build_steps
+from rig.protocols import apparatus_of, build_steps
 from rig.recorder import Recorder
 from rig.recovery import recover
 from rig.safe_state import make_safe, release
 from rig.scene import Scene
 from sequences.errors import StepFailed
 from sequences.reference import reference
-from sequences.step import Apparatus, Step, play
+from sequences.step import Step, play
 
 if TYPE_CHECKING:
     from drivers.emulated.faults import Faults
@@ -136,7 +136,7 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     reporter = Reporter([*request.observers, *opened.observers])
     stage = CommandedStage(opened.stage, lambda text: reporter.event("command", text))
     pump = None if opened.pump is None else CommandedPump(opened.pump, lambda text: reporter.event("command", text))
-    apparatus = Apparatus(stage, pump, reporter, request.bench.limits.look_ahead_um * 1e-6)
+    apparatus = apparatus_of(request.bench, stage, pump, reporter)
     steps = build_steps(request.scene, apparatus, request.hands)
     info = _info(request, opened, steps)
     journalled = request.bench.recording.survives_power_cut
@@ -239,7 +239,7 @@ def _make_ready(request: Request, opened: Opened) -> None:
 def reference_stage(request: Request, opened: Opened) -> None:
     """Run the reference sequence under the force interlock, without a recording."""
     reporter = Reporter(opened.observers)
-    apparatus = Apparatus(opened.stage, None, reporter, request.bench.limits.look_ahead_um * 1e-6)
+    apparatus = apparatus_of(request.bench, opened.stage, None, reporter)
     instruments = Instruments(opened.stage, None, opened.daq, opened.clock)
     steps = reference(apparatus, parking(request.bench))
     try:

@@ -51,12 +51,15 @@ class Apparatus:
     ----------
     look_ahead
         A move under way is never commanded further than this beyond the present position, m (dead man).
+    frame
+        Usual length of a frame, s.
     """
 
     stage: Stage
     pump: Pump | None
     tell: Teller
     look_ahead: float = 50e-6
+    frame: float = 20e-3
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,7 @@ def travel(
     StepFailed
         It takes much longer than it should.
     """
-    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.look_ahead, frame.force.size / frame.rate)))
+    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.look_ahead, apparatus.frame)))
     left = (3 * abs(target - frame.stage.position) / motion.speed + 5) * frame.rate
     try:
         while not motion.arrived(frame):
