@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+from rig.voice import say
 
 COMMANDS = {
     "run": "run a scene on a bench and record it",
@@ -37,17 +40,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if late:  # files after an option that came after files
         parsed.recordings += map(Path, late)
     try:
+        return _run(parsed)
+    finally:
+        _flush()
+
+
+def _run(parsed: argparse.Namespace) -> int:
+    try:
         return int(parsed.run(parsed))
     except KeyboardInterrupt:
-        print("rig: stopped by the operator", file=sys.stderr)
+        say("rig: stopped by the operator")
         return 130
     except BrokenPipeError:
-        return 0
+        return 0  # who reads has seen enough
     except Exception as error:
-        if not _is_ours(error):
-            raise
-        print(f"rig {parsed.command}: {error}", file=sys.stderr)
-        return int(getattr(error, "exit_code", 1))
+        if _is_ours(error):
+            say(f"rig {parsed.command}: {error}")
+            return int(getattr(error, "exit_code", 1))
+        if isinstance(error, OSError) and error.filename is not None:
+            say(f"rig {parsed.command}: {error.filename}: {error.strerror}. Remedy: check its name, folder and rights.")
+            return 2
+        raise
+
+
+def _flush() -> None:
+    """Write out what is buffered; where nobody reads it, that must not change the exit code."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

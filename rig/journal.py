@@ -55,8 +55,12 @@ class Journal:
     def __init__(self, recording: Path, header: Mapping[str, Any]) -> None:
         self._path = journal_of(recording)
         self._file = self._path.open("xb", buffering=0)
-        self._append(json.dumps(header).encode(), _MAGIC)
-        sync_folder(self._path)
+        try:
+            self._append(json.dumps(header).encode(), _MAGIC)
+            sync_folder(self._path)
+        except OSError:
+            self.close(keep=False)
+            raise
 
     def write(self, blocks: Mapping[str, NDArray[Any]]) -> None:
         """Append the rows that each dataset grows by; they survive a power cut from now on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -69,6 +69,17 @@ def unpack_pump(row: Any) -> PumpStatus:
     return PumpStatus(
         float(row["sent_s"]), float(row["received_s"]), state, float(row["rate_m3_s"]), float(row["volume_m3"])
     )
+
+
+def pieces(text: str) -> Iterator[str]:
+    """Yield the rows that a line of the log takes: a long one, such as a traceback, goes on in the next row."""
+    encoded = text.encode(errors="backslashreplace")
+    while True:
+        piece = encoded[: EVENTS["text"].itemsize].decode(errors="ignore")
+        yield piece
+        encoded = encoded[len(piece.encode()) :]
+        if not encoded:
+            return
 
 
 def lay_out(

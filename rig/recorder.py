@@ -10,11 +10,14 @@ import contextlib
 import os
 import re
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from io import BufferedWriter
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +27,23 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import PumpStatus
 from rig.errors import FileError
-from rig.journal import Journal, sync
-from rig.layout import ENDING, EVENTS, FRAMES, PREDICTIONS, PUMP, PUMP_STATES, STAGE, STEPS, extend, lay_out, pack_stage
+from rig.journal import Journal, journal_of, sync
+from rig.layout import (
+    ENDING,
+    EVENTS,
+    FRAMES,
+    PREDICTIONS,
+    PUMP,
+    PUMP_STATES,
+    STAGE,
+    STEPS,
+    extend,
+    lay_out,
+    pack_stage,
+    pieces,
+)
 from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase
+from rig.recording_file import free_names
 from rig.seal import seal
 from sequences.frame import Frame
 
@@ -37,6 +54,64 @@ LEAST_ROOM = 16 << 20
 _NONE = np.empty(0)
 
 
+def insist_on_new(path: Path) -> None:
+    """Refuse a name under which no recording can be written; to be asked before anything is opened.
+
+    Raises
+    ------
+    FileError
+        It does not end in .h5, is taken, too long or no text, its folder is none, or its disk is full.
+    """
+    try:
+        reason, remedy = _objection(path)
+    except UnicodeEncodeError:
+        reason, remedy = "its name is no text", "choose another name with --out"
+    except OSError as error:
+        reason, remedy = str(error), "choose another name with --out"
+    if reason:
+        raise FileError(f"recording {path}: {reason}. Remedy: {remedy}.")
+
+
+def _objection(path: Path) -> tuple[str, str]:
+    """Return why no recording can have this name, and the remedy; nothing for a good one."""
+    str(path).encode()
+    if path.suffix.casefold() != ".h5":
+        return "its name does not end in .h5", "choose another name with --out"
+    if _is_there(path):
+        return "exists already", "choose another name with --out"
+    journal = journal_of(path)
+    if _is_there(journal):
+        return (
+            f"{journal} of an earlier recording with this name lies there",
+            "choose another name with --out; remove the journal only if that recording is not missed",
+        )
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    room = _room(folder)
+    if room < LEAST_ROOM:
+        return f"only {room >> 20} MiB are left on the disk", "free space, or choose another disk with --out"
+    return "", ""
+
+
+def _room(folder: Path, written: int = 0) -> int:
+    """Return how many bytes a file in this folder, which holds so many already, can still take."""
+    free = shutil.disk_usage(folder).free
+    if sys.platform != "win32":
+        import resource
+
+        largest, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+        if largest != resource.RLIM_INFINITY:
+            return min(free, largest - written)
+    return free
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    return True
+
+
 class Recorder:
     """Writes one recording.
 
@@ -45,7 +120,7 @@ class Recorder:
     Parameters
     ----------
     path
-        Must not exist: a recording is never overwritten.
+        Must not exist: a recording is never overwritten. After ``close`` where the recording lies.
     channels, units
         Names and units of the raw channels, in order.
     metadata
@@ -84,17 +159,20 @@ class Recorder:
             "units": list(units),
             "started": datetime.now(UTC).isoformat(),
         }
+        image, places = _laid_out(header)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = h5py.File(path, "x", libver="latest")
-            if journalled:
-                self._journal = Journal(path, header)
+            _write_new(path, image)
         except (OSError, ValueError) as error:
-            remedy = "choose another name with --out" if path.exists() else "check the folder, its rights and its space"
-            raise FileError(f"recording {path}: cannot be created ({error}). Remedy: {remedy}.") from error
+            raise _not_created(path, error) from error
+        try:
+            self._journal = Journal(path, header) if journalled else None
+        except OSError as error:
+            path.unlink()
+            raise _not_created(path, error) from error
         self._held = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-        self._sets = lay_out(self._file, **header)
-        self._file.flush()
+        self._file = h5py.File(path, "r+", libver="latest")
+        self._sets = {name: self._file[place] for name, place in places.items()}
         self._file.swmr_mode = True
 
     def append(self, frame: Frame, height: NDArray[np.float64], arrived: float) -> None:
@@ -112,7 +190,8 @@ class Recorder:
 
     def event(self, event: Event) -> None:
         """Take one line of the log."""
-        self._put("events", _row(EVENTS, event.sample, event.kind, event.text))
+        for piece in pieces(event.text):
+            self._put("events", _row(EVENTS, event.sample, event.kind, piece))
 
     def prediction(self, sample: int, text: str) -> None:
         """Take one live prediction as JSON."""
@@ -181,13 +260,15 @@ class Recorder:
             self._file.flush()
         try:
             self._file.close()
-            place = self._rescued()
-            seal(place)
+            asked, self.path = self.path, self._rescued()
+            seal(self.path)
             if self._journal is not None:
-                sync(place)
+                sync(self.path)
                 self._journal.close(keep=False)
         finally:
             os.close(self._held)
+        if self.path != asked:
+            raise FileError(f"recording {asked}: its place was taken, it now lies in {self.path}")
 
     def _commit(self) -> None:
         self.flush()
@@ -198,9 +279,9 @@ class Recorder:
         if not self._in_place():
             raise FileError(
                 f"recording {self.path}: the file has been removed or moved while it was written. Remedy: leave it in "
-                "its place; it is written there again now that the run has ended."
+                "its place; it is written again now that the run has ended."
             )
-        room = shutil.disk_usage(self.path.parent).free
+        room = _room(self.path.parent, os.fstat(self._held).st_size)
         if room < LEAST_ROOM:
             raise FileError(
                 f"recording {self.path}: only {room >> 20} MiB are left on the disk. "
@@ -208,7 +289,7 @@ class Recorder:
             )
 
     def _in_place(self) -> bool:
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):
             return os.path.samestat(os.fstat(self._held), self.path.stat())
         return False
 
@@ -216,13 +297,22 @@ class Recorder:
         """Return where the closed file lies; one that was removed is written again from the handle we kept."""
         if self._in_place():
             return self.path
-        taken = self.path.exists()
-        path = self.path.with_name(f"{self.path.stem}-rescued{self.path.suffix}") if taken else self.path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self._held, "rb", closefd=False) as held, path.open("xb") as written:
+        written = self._new_place()
+        with open(self._held, "rb", closefd=False) as held, written:
             held.seek(0)
             shutil.copyfileobj(held, written)
-        return path
+        return Path(written.name)
+
+    def _new_place(self) -> BufferedWriter:
+        """Open the first free name: where the file was or, if its folder is gone for good, further up."""
+        rescued = self.path.with_name(f"{self.path.stem}-rescued{self.path.suffix}")
+        for folder in self.path.parents:
+            with contextlib.suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                for name in chain([self.path], free_names(rescued)):
+                    with contextlib.suppress(FileExistsError):
+                        return (folder / name.name).open("xb")
+        raise FileError(f"recording {self.path}: was removed and can be written nowhere again")
 
     @contextlib.contextmanager
     def _detached_on_failure(self) -> Iterator[None]:
@@ -253,11 +343,40 @@ class Recorder:
             self._pending.setdefault(name, []).append(block)
 
 
+def _laid_out(header: Mapping[str, Any]) -> tuple[bytes, dict[str, str]]:
+    """Return an empty recording as bytes, and where each of its datasets lies.
+
+    It is made in memory: a disk that refuses it then gives an ordinary error, where HDF5 would crash the interpreter.
+    """
+    with h5py.File("empty", "w", driver="core", backing_store=False, libver="latest") as file:
+        places = {name: dataset.name for name, dataset in lay_out(file, **header).items()}
+        file.flush()
+        return file.id.get_file_image(), places
+
+
+def _write_new(path: Path, content: bytes) -> None:
+    """Write a file that must not exist; where the disk refuses it, nothing is left behind."""
+    file = path.open("xb")
+    try:
+        with file:
+            file.write(content)
+    except OSError:
+        path.unlink()
+        raise
+
+
+def _not_created(path: Path, error: Exception) -> FileError:
+    return FileError(
+        f"recording {path}: cannot be created ({error}). Remedy: check the folder, its rights and its space, "
+        "or choose another name with --out."
+    )
+
+
 def _scratch() -> str | None:
     """Return a directory in memory where there is one: the disk may be full."""
     return "/dev/shm" if os.path.isdir("/dev/shm") else None
 
 
 def _row(table: np.dtype[Any], *values: Any) -> NDArray[Any]:
-    cells = tuple(value.encode() if isinstance(value, str) else value for value in values)
+    cells = tuple(value.encode(errors="backslashreplace") if isinstance(value, str) else value for value in values)
     return np.array([cells], table)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 
 import h5py
@@ -16,6 +17,12 @@ def insist(path: Path) -> None:
     """Refuse a path where there is no file."""
     if not path.is_file():
         raise FileError(f"recording {path}: no such file. Remedy: check the path.")
+
+
+def free_names(path: Path) -> Iterator[Path]:
+    """Yield a name and, where it is taken, ``-2``, ``-3`` and so on behind it; create with ``x``, or look first."""
+    for number in count(1):
+        yield path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import Identity, PumpStatus, StageStatus
-from rig.layout import unpack_pump, unpack_stage
+from rig.layout import pieces, unpack_pump, unpack_stage
 from rig.observe import Controls, Event, StepEvent, StepPhase, Wish
 from rig.recording import Recording
 from sequences.frame import Frame
@@ -209,7 +209,7 @@ class Verification:
     def event(self, event: Event) -> None:
         """Keep a derived line of the log for ``finish``."""
         if event.kind in _DERIVED:
-            self._events.append((event.sample, event.kind, event.text))
+            self._events += [(event.sample, event.kind, piece) for piece in pieces(event.text)]
 
     def prediction(self, sample: int, text: str) -> None:
         """Compare a live prediction, its run time aside."""
@@ -228,9 +228,8 @@ class Verification:
             for row in recording.events
             if (kind := row["kind"].decode()) in _DERIVED
         ]
-        ours = [(sample, kind, text.encode()[:400].decode(errors="ignore")) for sample, kind, text in self._events]
         self._compare_lists("step", self._steps, steps)
-        self._compare_lists("log line", ours, events)
+        self._compare_lists("log line", self._events, events)
         counts = [("frames", self.frames, len(recording.frames))]
         if predictions:
             counts.append(("live predictions", self.predictions, len(recording.predictions)))

@@ -6,7 +6,6 @@ import json
 import os
 import platform
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Iterable, Iterator
@@ -27,10 +26,11 @@ from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
 from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
 from rig.protocols import apparatus_of, build_steps
-from rig.recorder import Recorder
+from rig.recorder import Recorder, insist_on_new
 from rig.recovery import recover
 from rig.safe_state import make_safe, release
 from rig.scene import Scene
+from rig.voice import say
 from sequences.errors import StepFailed
 from sequences.reference import reference
 from sequences.step import Step, play
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 PROGRAM_ERROR = 70
 """Exit code of a run that a defect of the program itself has ended."""
+
+_ENDING_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+"""What asks a program to end: Ctrl-C, the system, a closed terminal; Ctrl-Break on Windows."""
 
 _REPORTED = (DeviceError, RigError, StepFailed)
 _LIBRARIES = ("membrane-adhesion-rig", "numpy", "h5py", "pipython", "pyserial", "nidaqmx", "grpcio")
@@ -54,7 +57,7 @@ class Request:
     scene_text, bench_text
         The files as they were read; they are kept in the recording.
     out
-        The recording; it must not exist.
+        The recording, which must not exist; afterwards where it lies, for its place may have been taken meanwhile.
     live
         Whether to predict live where the papers have a model.
     observers, controls
@@ -99,6 +102,7 @@ def run_scene(request: Request) -> Ending:
         Afterwards every failure is in the returned ending and in the recording.
     """
     check(request.scene, request.bench)
+    insist_on_new(request.out)
     opened = open_instruments(request)
     ending: Ending | None = None
     with _signals(request.controls, opened):
@@ -129,7 +133,7 @@ def _leave(opened: Opened, ending: Ending | None = None) -> None:
     told = "" if ending is None else ending.reason
     for failure in failures:
         if failure.partition(" failed")[0] not in told:
-            print(f"rig: {failure}. Remedy: switch the device off by hand.", file=sys.stderr)
+            say(f"rig: {failure}. Remedy: switch the device off by hand.")
 
 
 def _recorded(request: Request, opened: Opened) -> Ending:
@@ -154,6 +158,7 @@ def _recorded(request: Request, opened: Opened) -> Ending:
         failures = make_safe(stage, pump, opened.daq)
         reporter.event("timing", f"frame to interlocks passed: {loop.checks.describe()} of {loop.checks.count} frames")
         ending = _finish(recorder, reporter, ending, failures, loop.samples)
+        request.out = recorder.path
     reporter.store = None  # closed
     reporter.notify("finished", ending)
     return ending
@@ -182,7 +187,6 @@ def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
     except Exception as error:  # noqa: BLE001 - a defect of the program must not cost the recording or the stop
         text = f"the program has failed in step {reporter.step}: {error!r}"
         reporter.event("fault", f"{text}\n{traceback.format_exc()}")
-        traceback.print_exc()
         return Ending(f"{text}. Remedy: report it with the recording, which is complete.", PROGRAM_ERROR, loop.samples)
     return Ending("done", 0, loop.samples)
 
@@ -193,6 +197,7 @@ def _finish(recorder: Recorder, reporter: Reporter, ending: Ending, failures: li
     if failures:
         remedy = "switch it off by hand." if "Remedy" in reason else "Remedy: switch it off by hand."
         reason = f"{reason.rstrip('.')}. Besides, {', '.join(failures)}; {remedy}"
+    samples = recorder.acknowledged if recorder.failed else samples
     ending = Ending(reason, ending.exit_code if ending.exit_code or not failures else 1, samples)
     try:
         for failure in failures:
@@ -201,6 +206,7 @@ def _finish(recorder: Recorder, reporter: Reporter, ending: Ending, failures: li
         recorder.end(ending)
         recorder.close()
     except (RigError, OSError, RuntimeError) as error:
+        samples = recorder.acknowledged if recorder.failed else samples
         ending = Ending(f"{ending.reason}; {error}", ending.exit_code or 2, samples)
     if recorder.failed:
         with suppress(FileError):  # no room for the copy; the ending's message names `rig recover`
@@ -302,7 +308,7 @@ def _metadata(request: Request) -> dict[str, str]:
 
 @contextmanager
 def _signals(controls: Controls, opened: Opened) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run in good order; a second one sends the emergency stop at once.
+    """Ctrl-C, SIGTERM and a closed terminal end the run in good order; a second one sends the emergency stop at once.
 
     Signals never raise here: the loop leaves through the safe state, undisturbed.
     """
@@ -311,6 +317,7 @@ def _signals(controls: Controls, opened: Opened) -> Iterator[None]:
         yield
         return
     count = 0
+    untold: list[str] = []
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         nonlocal count
@@ -321,12 +328,15 @@ def _signals(controls: Controls, opened: Opened) -> Iterator[None]:
         try:
             controls.emergency_stop()
         except DeviceError as error:  # the loop ends the run at its next frame all the same
-            print(f"rig: {error}", file=sys.stderr)
+            untold.append(str(error))
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
+    numbers = [getattr(signal, name) for name in _ENDING_SIGNALS if hasattr(signal, name)]
+    numbers = [number for number in numbers if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN]
     before: dict[signal.Signals, Any] = {number: signal.signal(number, on_signal) for number in numbers}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        for failure in untold:
+            say(f"rig: {failure}")

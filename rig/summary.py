@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from model import ModelError, predict
 from rig.calibrate import calibrate
 from rig.measured import as_run
 from rig.recording import load_recording
+from rig.recording_file import free_names
 
 if TYPE_CHECKING:
     from analysis.pipeline import Analysis
@@ -31,18 +33,20 @@ _STATEMENTS = ("Work of adhesion (S13)",)
 def summarise(path: Path, model: str = "cone") -> str:
     """Analyse a recording, draw its picture beside it, and return the table of measurement and model.
 
-    A calibration gives the lines of the bench file instead, and writes them beside the recording too.
+    A calibration gives the lines of the bench file instead, and writes them beside the recording too. No file that
+    is there already is touched: a taken name gets a number.
     """
     from analysis import analyze
     from analysis.figures import overview
     from analysis.figures.fit_picture import save_fit
 
     recording = load_recording(path)
-    picture = path.with_suffix(".png")
+    picture = _beside(path, ".png")
     calibration = calibrate(recording)
     if calibration is not None:
-        lines = path.with_suffix(".toml")
-        lines.write_text(calibration.toml, encoding="utf-8", newline="\n")
+        lines = _beside(path, ".toml")
+        with lines.open("x", encoding="utf-8", newline="\n") as file:
+            file.write(calibration.toml)
         save_fit(calibration.picture, picture)
         return f"{calibration}\nrecording  {path}\nlines      {lines}\npicture    {picture}"
     run = as_run(recording)
@@ -58,6 +62,11 @@ def summarise(path: Path, model: str = "cone") -> str:
     overview(run, analysis, prediction, picture)
     table = _table(analysis, prediction) if run.protocol == "pull_off" else _list(analysis)
     return f"{table}{note}\nrecording  {path}\npicture    {picture}"
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """Return a name beside the recording that nothing has yet."""
+    return next(name for name in free_names(path.with_suffix(suffix)) if not os.path.lexists(name))
 
 
 def _table(analysis: Analysis, prediction: Prediction | None) -> str:

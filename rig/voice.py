@@ -14,6 +14,12 @@ LAST_WORDS_S = 1.0
 """So long the end of a run waits for a terminal that is behind."""
 
 
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print on standard error, or elsewhere; a closed pipe or window changes nothing of what the program does."""
+    with contextlib.suppress(OSError):
+        print(text, file=sys.stderr if stream is None else stream, flush=True)
+
+
 class Voice:
     """Writes what it is given to a stream, in order.
 

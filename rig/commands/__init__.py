@@ -3,6 +3,8 @@
 The modules import only argparse at the top; whatever a command needs is imported when it runs.
 """
 
+from __future__ import annotations
+
 import argparse
 
 SCENE = "scene file, or the name of one that ships"
@@ -18,3 +20,10 @@ def count(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number}: must be at least 1")
     return number
+
+
+def natural(text: str) -> int:
+    """Read an option that counts, from 0."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of 0 or more")
+    return int(text)

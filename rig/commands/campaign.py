@@ -138,10 +138,10 @@ def _observers(request: Request, keyboard: Keyboard | None) -> list[Observer]:
 
 def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reason: str) -> int:
     """Enter a test that has succeeded; say why one has not."""
-    import sys
+    from rig.voice import say
 
     if code:
-        print(f"rig campaign: {test.key}: {reason}", file=sys.stderr)
+        say(f"rig campaign: {test.key}: {reason}")
     else:
         journal.write(test.key, recording, scene=test.digest)
     return code

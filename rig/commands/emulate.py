@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rig.commands import SCENE
+from rig.commands import SCENE, natural
 
 if TYPE_CHECKING:
     from drivers.emulated.truth import Truth
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times real time (default: 1)")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="fault script (TOML)")
     parser.add_argument("--scene", metavar="SCENE", help=f"what to pull off: {SCENE} (default: 60 mm sphere)")
-    parser.add_argument("--seed", type=int, default=0, help="which specimen and which noise")
+    parser.add_argument("--seed", type=natural, default=0, help="which specimen and which noise")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from rig.commands import BENCH
@@ -24,8 +25,9 @@ def run(arguments: argparse.Namespace) -> int:
     bench, bench_text = load_bench(arguments.bench)
     if not arguments.path_is_clear:
         print("The stage will run to its switch, up to its full travel. Take specimen and gripper out of its path.")
-        if input("Type 'clear' when the path is clear: ").strip() != "clear":
-            raise Refused("not confirmed. Nothing has moved.")
+        print("Type 'clear' when the path is clear: ", end="", flush=True)
+        if sys.stdin is None or sys.stdin.readline().strip() != "clear":
+            raise Refused("not confirmed, nothing has moved. Remedy: type clear, or give --path-is-clear.")
     scene, text = load_scene("sphere-60mm-vented")
     position = reference_only(Request(scene, text, bench, bench_text, Path()))
     print(f"referenced; the stage stands at {position * 1e3:.4f} mm")

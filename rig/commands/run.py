@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rig.commands import BENCH, SCENE
+from rig.commands import BENCH, SCENE, natural
 
 if TYPE_CHECKING:
     from rig.campaign import PlannedTest
@@ -23,11 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", nargs="?", default=DEFAULT_SCENE, help=SCENE)
     parser.add_argument("--bench", type=Path, help=f"{BENCH}; without one everything is emulated")
     parser.add_argument("--out", type=Path, help="recording to write (default: recordings/<scene>-<time>.h5)")
-    parser.add_argument("--seed", type=int, default=0, help="emulated bench: which specimen and which noise")
+    parser.add_argument("--seed", type=natural, default=0, help="emulated bench: which specimen and which noise")
     parser.add_argument("--speed", default="max", help="emulated bench: times real time, or max (default)")
     parser.add_argument("--direct", action="store_true", help="emulated bench: without the wires between")
     parser.add_argument("--faults", type=Path, help="emulated bench: fault script")
-    parser.add_argument("--repeat", type=int, default=1, help="how many tests in a row, up to 1000")
+    parser.add_argument("--repeat", type=natural, default=1, help="how many tests in a row, up to 1000")
     parser.add_argument("--console", action="store_true", help="watch and command the run in the console's window")
     parser.add_argument("--link", action="store_true", help="let consoles attach")
     parser.add_argument("--no-live", action="store_true", help="no live prediction")
@@ -62,6 +62,7 @@ def _requests(arguments: argparse.Namespace) -> Iterator[tuple[PlannedTest, Requ
     from rig.campaign import MOST_REPEATS, single
     from rig.errors import FileError
     from rig.library import load_scene
+    from rig.recorder import insist_on_new
     from rig.session import Request
 
     if not 1 <= arguments.repeat <= MOST_REPEATS:
@@ -76,6 +77,9 @@ def _requests(arguments: argparse.Namespace) -> Iterator[tuple[PlannedTest, Requ
 
         faults = load_faults(arguments.faults)
     tests = single(scene, text, Path(arguments.scene).stem, arguments.repeat, arguments.seed)
+    if arguments.out is not None:
+        for test in tests:
+            insist_on_new(_destination(arguments.out, test.key, len(tests)))
     for number, test in enumerate(tests, 1):
         yield (
             test,
@@ -128,7 +132,7 @@ def _run_once(request: Request, arguments: argparse.Namespace, keyboard: Keyboar
     from rig.operator import Prompts
     from rig.session import run_scene
     from rig.terminal import Terminal
-    from rig.voice import Voice
+    from rig.voice import Voice, say
 
     voice = Voice()
     observers: list[Observer] = [Terminal(voice)]
@@ -142,10 +146,9 @@ def _run_once(request: Request, arguments: argparse.Namespace, keyboard: Keyboar
             observers.append(links.enter_context(LinkServer(request.controls)))
         ending = run_scene(request)
     if ending.exit_code:
-        print(f"rig run: {ending.reason}", file=sys.stderr)
-        print(f"rig run: the recording {request.out} holds the {ending.samples} samples so far.", file=sys.stderr)
+        say(f"rig run: {ending.reason}\nrig run: the recording {request.out} holds {ending.samples} samples.")
     elif not arguments.no_picture:
         from rig.summary import summarise
 
-        print(summarise(request.out))
+        say(summarise(request.out), sys.stdout)
     return ending
