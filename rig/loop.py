@@ -279,9 +279,9 @@ class Loop:
             self._reporter.event("fault", str(error))
 
     def _record(self, frame: Frame, height: Array, arrived: float) -> None:
+        self.samples = self._reporter.sample = frame.stop
         if self._store is not None:
             self._store.append(frame, height, arrived)
-        self.samples = self._reporter.sample = frame.stop
 
     def _poll_pump(self, number: int) -> PumpStatus | None:
         pump = self._instruments.pump

@@ -64,12 +64,11 @@ def insist_on_new(path: Path) -> None:
     """
     try:
         reason, remedy = _objection(path)
-    except UnicodeEncodeError:
-        reason, remedy = "its name is no text", "choose another name with --out"
-    except OSError as error:
+    except (OSError, UnicodeEncodeError) as error:
         reason, remedy = str(error), "choose another name with --out"
     if reason:
-        raise FileError(f"recording {path}: {reason}. Remedy: {remedy}.")
+        name = str(path).encode(errors="backslashreplace").decode()
+        raise FileError(f"recording {name}: {reason}. Remedy: {remedy}.")
 
 
 def _objection(path: Path) -> tuple[str, str]:

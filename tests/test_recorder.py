@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -10,8 +11,13 @@ from unittest.mock import patch
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rig.errors import BeingWritten, FileError
+from rig.layout import EVENTS, pieces
+from rig.observe import Watcher
+from rig.recorder import Recorder
 from rig.recording import load_recording, open_recording
 from rig.recovery import recover
 from rig.session import run_scene
@@ -115,3 +121,125 @@ def test_a_bit_flip_never_crashes_the_reader(request_for):
         request.out.write_bytes(whole[:length])
         with pytest.raises(FileError):
             load_recording(request.out)
+
+
+LIMITED = """
+import resource, sys
+import h5py, numpy
+from rig import recorder
+from rig.cli import main
+limit, recorder.LEAST_ROOM = int(sys.argv[1]), int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+sys.exit(main(["run", "sphere-60mm-vented", "--direct", "--no-live", "--no-picture", "--out", sys.argv[3]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size to set")
+@pytest.mark.parametrize(("limit", "least"), [(512, 16 << 20), (512, -(1 << 30)), (20_000, -(1 << 30))])
+def test_no_room_at_the_start_is_one_message_and_no_crash(tmp_path, limit, least):
+    words = [sys.executable, "-c", LIMITED, str(limit), str(least), str(tmp_path / "x.h5")]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert told.returncode == 2, told.stderr
+    assert told.stderr.count("\n") == told.stderr.count("Remedy") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size to set")
+def test_a_run_ends_before_its_file_is_as_large_as_it_may_be(tmp_path):
+    limit, least = 1_000_000, 800_000
+    words = [sys.executable, "-c", LIMITED, str(limit), str(least), str(tmp_path / "x.h5")]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert told.returncode == 2, told.stderr
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert file["entry/ending"][0]["exit_code"] == 2
+
+
+class _Once(Watcher):
+    """Does something once, some frames into the run."""
+
+    def __init__(self, act):
+        self._act, self._frames = act, 0
+
+    def frame(self, frame):
+        self._frames += 1
+        if self._frames == 100:
+            self._act()
+
+
+def test_a_recording_whose_name_and_next_name_are_taken_is_written_under_a_third(request_for):
+    request = request_for()
+    out = request.out
+
+    def take():
+        for path in (out, out.with_name("run-rescued.h5")):
+            path.unlink(missing_ok=True)
+            path.write_bytes(b"another's")
+
+    request.observers = [_Once(take)]
+    ending = run_scene(request)
+    assert ending.exit_code == 2
+    rescued = out.with_name("run-rescued-2.h5")
+    assert str(rescued) in ending.reason
+    assert request.out == rescued
+    assert load_recording(rescued).force.size == ending.samples
+    assert out.read_bytes() == out.with_name("run-rescued.h5").read_bytes() == b"another's"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a folder in use cannot be removed there")
+def test_a_recording_whose_folder_becomes_a_file_is_written_beside_it(request_for, tmp_path):
+    folder = tmp_path / "folder"
+    request = request_for(out=folder / "run.h5")
+
+    def replace():
+        (folder / "run.h5").unlink()
+        folder.rmdir()
+        folder.write_bytes(b"a file")
+
+    request.observers = [_Once(replace)]
+    ending = run_scene(request)
+    assert ending.exit_code == 2
+    assert str(tmp_path / "run.h5") in ending.reason
+    assert load_recording(tmp_path / "run.h5").force.size == ending.samples
+
+
+def test_a_failed_write_tells_what_is_acknowledged(request_for):
+    request = request_for()
+    recorders = []
+
+    def recorder(*arguments, **options):
+        recorders.append(Recorder(*arguments, **options))
+        return recorders[0]
+
+    def fail():
+        held = os.open(request.out, os.O_RDONLY)
+        os.dup2(held, recorders[0]._file.id.get_vfd_handle())
+        os.close(held)
+
+    request.observers = [_Once(fail)]
+    with patch("rig.session.Recorder", recorder):
+        ending = run_scene(request)
+    assert ending.exit_code == 2
+    assert f"after {ending.samples} samples" in ending.reason
+    assert ending.samples == recorders[0].acknowledged <= load_recording(request.out).force.size
+
+
+def test_the_whole_traceback_of_a_defect_is_in_the_recording(request_for):
+    def deep(depth):
+        if depth:
+            deep(depth - 1)
+        raise ZeroDivisionError("the cause, at the end – in Umlauten: äöü")
+
+    request = request_for(referenced=True)
+    with patch("rig.converter.SensorConverter.check", lambda _: deep(20)):
+        ending = run_scene(request)
+    assert ending.exit_code == 70
+    told = [row["text"].decode() for row in load_recording(request.out).events if row["kind"] == b"fault"]
+    assert len(told) > 2
+    assert "".join(told).endswith("ZeroDivisionError: the cause, at the end – in Umlauten: äöü\n")
+
+
+@given(st.text())
+def test_a_long_line_of_the_log_is_kept_whole(text):
+    rows = list(pieces(text))
+    assert all(len(row.encode()) <= EVENTS["text"].itemsize for row in rows)
+    assert "".join(rows) == text.encode(errors="backslashreplace").decode()
