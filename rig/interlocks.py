@@ -78,6 +78,14 @@ class Interlocks:
                 "Remedy: open the vent, check the tubing and the sensor's supply."
             )
 
+    def first_beyond(self, force: Array, pressure: Array | None) -> int:
+        """Return the index of the first sample beyond a limit; of the first of all where none is."""
+        beyond = ~((force <= self.limits.compression) & (force >= -self.limits.tension))
+        if pressure is not None and self.limits.pressure is not None:
+            lowest, highest = self.limits.pressure
+            beyond |= ~((pressure >= lowest) & (pressure <= highest))
+        return int(beyond.argmax())
+
     def check_motion(self, stage: StageStatus, lag: float) -> None:
         """Check where the stage is and that the data are fresh."""
         low, high = self.limits.travel

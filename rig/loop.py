@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import DeviceError, SensorFault
 from drivers.interfaces import Clock, Daq, Pump, PumpStatus, Stage, StageStatus
-from rig.errors import Interlock, StoppedByOperator
+from rig.errors import FileError, Interlock, StoppedByOperator
 from rig.interlocks import Interlocks
 from rig.latency import Latencies
 from rig.observe import Controls, Event, Observer, StepEvent, StepPhase, Wish
@@ -156,6 +156,15 @@ class Loop:
         Samples in a frame; a frame that comes late is followed by one longer by what has come in meanwhile.
     pump_frames
         The pump is polled once in so many frames.
+
+    Attributes
+    ----------
+    samples
+        Recorded so far.
+    interlock_latency, stop_age
+        From the frame read, and from the sample that passed the limit, to the stop sent, s; ``None`` without one.
+    checks, ages
+        From the frame read, and from its oldest sample, to the interlocks passed.
     """
 
     def __init__(
@@ -182,8 +191,11 @@ class Loop:
         self._pump_status: PumpStatus | None = None
         self._holding = self._resumed = False
         self.samples = 0
+        self._timebase: TimeBase
         self.interlock_latency: float | None = None
+        self.stop_age: float | None = None
         self.checks = Latencies()
+        self.ages = Latencies()
 
     def run(self, sequence: Sequencer) -> None:
         """Run until the sequence ends. Leaves the instruments as they are: the caller makes them safe.
@@ -225,19 +237,25 @@ class Loop:
         stage, daq, clock = self._instruments.stage, self._instruments.daq, self._instruments.clock
         self._stage_status = stage.status()
         daq.start()
-        timebase = TimeBase(daq.rate)
+        timebase = self._timebase = TimeBase(daq.rate)
         number = waiting = 0
         while True:
             volts = daq.read(self._frame_samples * (1 + waiting))
             arrived = clock()
-            force, pressure = self._checked(volts)
-            self._stage_status = status = stage.status()
-            frame = Frame(number, self.samples, daq.rate, volts, force, pressure, status, self._poll_pump(number))
-            waiting = int(self._take(frame, timebase, arrived) * daq.rate / self._frame_samples)
+            timebase.arrive(self.samples + volts.shape[1], volts.shape[1], arrived)
+            force, pressure = self._checked(volts, arrived)
+            try:
+                self._stage_status = status = stage.status()
+                pump_status = self._poll_pump(number)
+            except Exception:
+                self._keep_last(volts, force, pressure, arrived)
+                raise
+            frame = Frame(number, self.samples, daq.rate, volts, force, pressure, status, pump_status)
+            waiting = int(self._take(frame, arrived) * daq.rate / self._frame_samples)
             yield frame
             number += 1
 
-    def _checked(self, volts: Array) -> tuple[Array, Array | None]:
+    def _checked(self, volts: Array, arrived: float) -> tuple[Array, Array | None]:
         """Convert and check before anything slower is done; a passed limit stops the stage here."""
         began = time.perf_counter()
         force, pressure = self._converter.convert(volts)
@@ -247,23 +265,35 @@ class Loop:
         except (Interlock, SensorFault):
             self._stop_at_once()
             self.interlock_latency = time.perf_counter() - began
-            self._keep_last(volts, force, pressure)
+            self.stop_age = self._age(self._interlocks.first_beyond(force, pressure))
+            self._keep_last(volts, force, pressure, arrived)
             raise
         self.checks.add(time.perf_counter() - began)
+        self.ages.add(self._age(0))
         return force, pressure
 
-    def _keep_last(self, volts: Array, force: Array, pressure: Array | None) -> None:
-        """Record the frame that passed the limit; the stage was polled last for the frame before."""
+    def _age(self, index: int) -> float:
+        """Return how old a sample of the frame just read is by the bench's clock, s."""
+        return self._timebase.age(self.samples + index, self._instruments.clock())
+
+    def _keep_last(self, volts: Array, force: Array, pressure: Array | None, arrived: float) -> None:
+        """Record the frame with which the run ends; stage or pump may have been polled last for the frame before.
+
+        If that fails too, what has ended the run stays what is told of it.
+        """
         status = self._stage_status
         frame = Frame(-1, self.samples, self._instruments.daq.rate, volts, force, pressure, status, self._pump_status)
-        self._record(frame, np.full(force.size, status.position), self._instruments.clock())
+        try:
+            self._record(frame, np.full(force.size, status.position), arrived)
+        except FileError as error:
+            self._reporter.event("fault", str(error))
         self._reporter.notify("frame", frame)
 
-    def _take(self, frame: Frame, timebase: TimeBase, arrived: float) -> float:
+    def _take(self, frame: Frame, arrived: float) -> float:
         """Return how late the frame was, s; what has come in meanwhile is read at once."""
-        height = timebase.place(frame.start, frame.force.size, arrived, frame.stage)
+        height = self._timebase.place(frame.start, frame.force.size, frame.stage)
         self._record(frame, height, arrived)
-        lag = timebase.lag(frame.stop, arrived)
+        lag = self._timebase.age(frame.stop, arrived)
         try:
             self._interlocks.check_motion(frame.stage, lag)
         except Interlock:

@@ -110,8 +110,8 @@ class ReplayedStage:
         """Return the next recorded poll; the one before the first frame is not recorded and is the first again."""
         index = min(max(self._next - 1, 0), len(self._rows) - 1)
         self._next += 1
-        if index < 0:
-            raise EndOfRecording
+        if index < 0 or (index > 0 and self._rows[index] == self._rows[index - 1]):
+            raise EndOfRecording  # the poll failed: the last frame was kept with the one before
         return unpack_stage(self._rows[index])
 
     def reference(self) -> None:

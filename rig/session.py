@@ -156,12 +156,21 @@ def _recorded(request: Request, opened: Opened) -> Ending:
         ending = _play(loop, steps, reporter)
     finally:
         failures = make_safe(stage, pump, opened.daq)
-        reporter.event("timing", f"frame to interlocks passed: {loop.checks.describe()} of {loop.checks.count} frames")
+        reporter.event("timing", _timing(loop, virtual=opened.virtual))
         ending = _finish(recorder, reporter, ending, failures, loop.samples)
         request.out = recorder.path
     reporter.store = None  # closed
     reporter.notify("finished", ending)
     return ending
+
+
+def _timing(loop: Loop, *, virtual: bool) -> str:
+    """Return how long the interlocks took and how old the samples were that they passed."""
+    clock = "the plant's clock, which waits for the program" if virtual else "the bench's clock"
+    return (
+        f"frame to interlocks passed: {loop.checks.describe()} of {loop.checks.count} frames; "
+        f"age of a frame's oldest sample then: {loop.ages.describe()} by {clock}"
+    )
 
 
 def add_live_prediction(reporter: Reporter, scene: Scene, bench: Bench, *, virtual: bool) -> None:
@@ -181,8 +190,9 @@ def _play(loop: Loop, steps: list[Step], reporter: Reporter) -> Ending:
         kind = "interlock" if isinstance(error, Interlock) else "fault"
         where = "" if f"step {reporter.step}" in str(error) else f" (in step {reporter.step})"
         reporter.event(kind, f"{error}{where}")
-        if loop.interlock_latency is not None:
-            reporter.event("timing", f"stop sent {loop.interlock_latency * 1e3:.2f} ms after the frame was read")
+        if loop.interlock_latency is not None and loop.stop_age is not None:
+            after = f"{loop.interlock_latency * 1e3:.2f} ms after the frame was read"
+            reporter.event("timing", f"stop sent {after}, {loop.stop_age * 1e3:.2f} ms after the sample that passed")
         return Ending(f"{error}{where}", int(getattr(error, "exit_code", 1)), loop.samples)
     except Exception as error:  # noqa: BLE001 - a defect of the program must not cost the recording or the stop
         text = f"the program has failed in step {reporter.step}: {error!r}"

@@ -22,7 +22,7 @@ CLOCKS_APART = 2e-4
 class TimeBase:
     """Maps sample indices to bench time and interpolates the stage onto the samples.
 
-    Everything follows from the arguments of ``place``, so that a replay gives the same numbers to the bit.
+    Everything follows from the arguments of ``arrive`` and ``place``: a replay gives the same numbers to the bit.
     """
 
     def __init__(self, rate: float) -> None:
@@ -31,12 +31,15 @@ class TimeBase:
         self.offset = math.inf
         """Bench time of sample 0, s."""
 
-    def place(self, start: int, count: int, arrived: float, stage: StageStatus) -> NDArray[np.float64]:
+    def arrive(self, stop: int, count: int, arrived: float) -> None:
+        """Take note of when a frame came in."""
+        self.offset = min(self.offset + CLOCKS_APART * count / self._rate, arrived - stop / self._rate)
+
+    def place(self, start: int, count: int, stage: StageStatus) -> NDArray[np.float64]:
         """Return the stage's position at each sample of a frame, m, linear between the polls around it.
 
         In the first frame it is this poll's position.
         """
-        self.offset = min(self.offset + CLOCKS_APART * count / self._rate, arrived - (start + count) / self._rate)
         times = self.offset + np.arange(start, start + count) / self._rate
         self._polls.append(_point(stage))
         while len(self._polls) > 2 and self._polls[1][0] <= times[0]:
@@ -45,9 +48,12 @@ class TimeBase:
         height: NDArray[np.float64] = np.interp(times, moments, positions)
         return height
 
-    def lag(self, stop: int, arrived: float) -> float:
-        """Return how much later than its samples a frame came, s."""
-        return arrived - stop / self._rate - self.offset
+    def age(self, sample: int, moment: float) -> float:
+        """Return how long before a moment a sample was taken, s; of a frame's end when it came: how late it was.
+
+        What even the fastest frame took from the DAQ to the program cannot be seen.
+        """
+        return moment - sample / self._rate - self.offset
 
 
 def _point(status: StageStatus) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from drivers.emulated.direct import DirectDaq
 from drivers.emulated.faults import Fault, Faults
 from drivers.errors import NotConnected
 from rig.bench import parse_bench
@@ -16,6 +17,7 @@ from rig.emulation import truth
 from rig.errors import FileError, Refused
 from rig.measured import load_run
 from rig.observe import Controls, StepPhase, Watcher
+from rig.recorder import Recorder
 from rig.recording import load_recording
 from rig.replay import Pace
 from rig.replay_session import replay
@@ -185,6 +187,43 @@ def test_a_stop_byte_that_cannot_be_sent_does_not_hide_the_limit_nor_lose_the_fr
     assert b"the stop could not be sent" in told[0][1]
 
 
+@pytest.mark.parametrize("device", ["stage", "pump"])
+def test_the_samples_read_when_a_poll_fails_are_kept(request_for, monkeypatch, device):
+    read = []
+
+    def keeping(daq, samples, real=DirectDaq.read):
+        read.append(real(daq, samples))
+        return read[-1]
+
+    monkeypatch.setattr(DirectDaq, "read", keeping)
+    faults = Faults([Fault(device, "unplugged", at_step="approach", after_samples=500)])
+    request = request_for("sphere-60mm-low", faults=faults, referenced=True)
+    ending = run_scene(request)
+    assert ending.exit_code == 6
+    assert ending.reason.startswith(f"{device}: ")
+    recording = load_recording(request.out)
+    delivered = np.concatenate(read, axis=1)
+    assert ending.samples == recording.force.size == delivered.shape[1]
+    assert np.array_equal(recording.volts, delivered)
+    assert replay(recording, pace=Pace()).differences == ()
+
+
+def test_a_disk_that_fails_with_the_last_frame_does_not_hide_the_limit(request_for, monkeypatch):
+    append = Recorder.append
+
+    def failing(recorder, frame, *rest):
+        append(recorder, frame, *rest)
+        if frame.number < 0:
+            raise FileError("the disk is full")
+
+    monkeypatch.setattr(Recorder, "append", failing)
+    request = request_for(faults=Faults([Fault("force", "over_range", at_step="preload", value=4.7)]))
+    ending = run_scene(request)
+    assert ending.exit_code == 3
+    told = [row["text"] for row in load_recording(request.out).events if row["kind"] in (b"fault", b"interlock")]
+    assert told[0] == b"the disk is full"
+
+
 def test_a_limit_of_time_stops_the_stage_and_is_told_as_an_interlock(request_for, monkeypatch):
     pressed = []
 
@@ -192,7 +231,7 @@ def test_a_limit_of_time_stops_the_stage_and_is_told_as_an_interlock(request_for
         pressed.append(stage)
 
     monkeypatch.setattr("drivers.emulated.direct.DirectStage.emergency_stop", press)
-    monkeypatch.setattr("rig.timebase.TimeBase.lag", lambda *_: 9.0)
+    monkeypatch.setattr("rig.timebase.TimeBase.age", lambda *_: 9.0)
     request = request_for(referenced=True)
     ending = run_scene(request)
     assert (ending.exit_code, len(pressed)) == (3, 1)

@@ -24,8 +24,8 @@ def lags(arrivals: np.ndarray) -> np.ndarray:
     timebase = TimeBase(RATE)
     found = []
     for number, arrived in enumerate(arrivals.tolist()):
-        timebase.place(number * FRAME, FRAME, arrived, poll(arrived))
-        found.append(timebase.lag((number + 1) * FRAME, arrived))
+        timebase.arrive((number + 1) * FRAME, FRAME, arrived)
+        found.append(timebase.age((number + 1) * FRAME, arrived))
     return np.array(found)
 
 
@@ -60,6 +60,9 @@ def test_the_stage_is_placed_where_it_was_at_the_sample_even_if_the_frame_came_l
     timebase = TimeBase(RATE)
     late = np.r_[np.zeros(50), np.linspace(0.0, 0.4, 50), np.full(50, 0.4)]
     arrivals = due(150) + late
-    heights = [timebase.place(k * FRAME, FRAME, moment, poll(moment)) for k, moment in enumerate(arrivals.tolist())]
+    heights = []
+    for number, arrived in enumerate(arrivals.tolist()):
+        timebase.arrive((number + 1) * FRAME, FRAME, arrived)
+        heights.append(timebase.place(number * FRAME, FRAME, poll(arrived)))
     true = SPEED * (5.0 + np.arange(FRAME, 150 * FRAME) / RATE)
     assert np.concatenate(heights[1:]) == pytest.approx(true, abs=SPEED * 2e-3)
