@@ -243,7 +243,13 @@ class PIStage:
         The halt goes out before any waiting; what follows only confirms it.
         """
         self._halting = True
-        self._send_urgent(f"HLT {self._axis}\n".encode())
+        try:
+            self._send_urgent(f"HLT {self._axis}\n".encode())
+            self._confirm_halt()
+        finally:
+            self._halting = False
+
+    def _confirm_halt(self) -> None:
         pressed = self._stop_pressed.is_set()
         try:
             with self._exchange("confirm the halt", check=False):
@@ -254,8 +260,6 @@ class PIStage:
                 self._stop_pressed.set()
             self._send_urgent(STOP_EVERYTHING)
             raise
-        finally:
-            self._halting = False
 
     def emergency_stop(self) -> None:
         """Write the stop byte past every lock and queue, from any thread.

@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+from unittest import mock
 
 import pytest
 from dialogue import flood
@@ -328,10 +329,15 @@ def test_limit_switches_that_are_active_low(world):
         stage.close()
 
 
-def test_somebody_elses_stop_is_reported(world):
+@pytest.mark.parametrize("after", ["nothing", "a stop that could not be sent"])
+def test_somebody_elses_stop_is_reported(world, monkeypatch, after):
     controller = EmulatedController(world, referenced=True)
     with serve_tcp(controller) as server:
         stage = PIStage(server.url)
+        if after != "nothing":
+            with monkeypatch.context() as cut, pytest.raises(NotConnected):
+                cut.setattr(stage._gateway, "send_urgent", mock.Mock(side_effect=ConnectionResetError))
+                stage.stop()
         stage.move_to(40e-3)
         controller.execute("STP")
         with pytest.raises(MotionFault, match="stopped by command"):
