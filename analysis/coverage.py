@@ -47,7 +47,7 @@ def _imperfections(generator: np.random.Generator) -> Imperfections:
         drift=4e-6 * normal(),
         wander=3e-4,
         bow=(SENSORS.force_linearity * normal(), SENSORS.force_linearity * normal()),
-        bow_load=SENSORS.force_capacity * 0.01 * 2 ** float(generator.uniform(-1, 1)),
+        bow_load=SENSORS.force_capacity * 0.005 * 2 ** float(generator.uniform(-1, 1)),
         force_gain=SENSORS.force_gain * normal(),
         pressure_gain=SENSORS.pressure_gain * normal(),
         pressure_offset=SENSORS.pressure_offset * normal(),

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from analysis.extraction import Extraction, extract
-from analysis.numerics import Array, Noise
+from analysis.numerics import RECTANGULAR, Array, Noise
 from analysis.preparation import fit_baseline
 from analysis.run import Run
 
@@ -52,7 +52,9 @@ def budget(work: Extraction) -> dict[str, dict[str, float]]:
     for name, uncertainty in work.stated.items():
         _add(parts[name], "fit", uncertainty)
     if "contact_height_m" in parts:
+        cell = float(np.ptp(np.asarray(work.details["contact"]["separation"])[:2]))
         _add(parts["contact_height_m"], "contact point", work.values["contact_spread_m"])
+        _add(parts["contact_height_m"], "contact point", cell / (2 * RECTANGULAR))
     return parts
 
 

@@ -76,7 +76,7 @@ class Imperfections:
     creep: float = 0.0
     creep_time: float = 9.0
     bow: tuple[float, float] = (0.0, 0.0)
-    bow_load: float = 0.05
+    bow_load: float = 0.025
     force_gain: float = 0.0
     pressure_gain: float = 0.0
     pressure_offset: float = 0.0

@@ -138,7 +138,7 @@ class BentCell(Cell):
     """A load cell whose line is out by ``bow`` (N) under tension and under compression, 63 % of it at ``bow_load``."""
 
     bow: tuple[float, float] = (0.0, 0.0)
-    bow_load: float = 0.05
+    bow_load: float = 0.025
 
     def output(self, force: Array, bridge: bool) -> Array:
         """Return the noise-free signal of the bent line."""
@@ -157,7 +157,7 @@ def instruments(bench: Bench, draw: Random) -> Device:
         linearity=0.0,
         noise=4e-5 * force.capacity_N,
         bow=(known.force_linearity * draw.normal(), known.force_linearity * draw.normal()),
-        bow_load=force.capacity_N * 0.01 * 2 ** float(draw.uniform(-1, 1)),
+        bow_load=force.capacity_N * 0.005 * 2 ** float(draw.uniform(-1, 1)),
     )
     sensor = PressureSensor()
     span = 2 * sensor.full_scale
