@@ -221,11 +221,11 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
         protocol.approach_speed_um_s,
         bench,
         {
-            "lower compression_N or shorten frame_ms": _room(bench, limits.compression_N) / reaction,
-            "lower preload_N or shorten lag_s": _room(bench, preload) / (reaction + limits.lag_s),
+            "lower compression_N or shorten frame_ms": room_um(bench, limits.compression_N) / reaction,
+            "lower preload_N or shorten lag_s": room_um(bench, preload) / (reaction + limits.lag_s),
         },
     )
-    furthest = _room(bench, preload)
+    furthest = room_um(bench, preload)
     if limits.look_ahead_um > furthest:
         found.append(
             f"look_ahead_um = {limits.look_ahead_um:g} would overload the load cell if this computer died at the "
@@ -239,7 +239,7 @@ def _retraction(scene: Scene, bench: Bench) -> list[str]:
     protocol = scene.protocol
     if not isinstance(protocol, ContactSection):
         return []
-    most = _room(bench, bench.limits.tension_N) / (bench.daq.frame_s + REACTION_S)
+    most = room_um(bench, bench.limits.tension_N) / (bench.daq.frame_s + REACTION_S)
     remedies = {"lower tension_N or shorten frame_ms": most}
     return _too_fast("retract_speed_um_s", protocol.retract_speed_um_s, bench, remedies)
 
@@ -260,7 +260,7 @@ def _stiffness(bench: Bench) -> str:
     return f"its force changes by {words}" if known else f"its compliance is unknown, {words} is assumed"
 
 
-def _room(bench: Bench, force: float) -> float:
+def room_um(bench: Bench, force: float) -> float:
     """Return how far the stage may go on from this force (N) against something rigid, um."""
     compliance = bench.force.compliance_um_per_N or STIFFEST_UM_PER_N
     return (OVERLOAD * bench.force.capacity_N - force) * compliance
@@ -269,11 +269,9 @@ def _room(bench: Bench, force: float) -> float:
 def parking(bench: Bench) -> Parking:
     """Return how the stage is brought to its starting height, so that it harms nothing that is in its way."""
     touch = TOUCH * bench.force.capacity_N
-    room = _room(bench, touch) * 1e-6
     start = bench.stage.start_mm
     return Parking(
         start=None if start is None else start * 1e-3,
-        speed=min(PARK_SPEED, room / (bench.daq.frame_s + REACTION_S)),
-        look_ahead=room,
+        speed=min(PARK_SPEED, room_um(bench, touch) * 1e-6 / (bench.daq.frame_s + REACTION_S)),
         touch=touch,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.interfaces import Pump, Stage
 from rig.bench import Bench
+from rig.check import room_um
 from rig.scene import (
     ComplianceSection,
     ContactSection,
@@ -21,8 +22,15 @@ from sequences.step import Apparatus, Step, Teller, by_hand
 
 
 def apparatus_of(bench: Bench, stage: Stage, pump: Pump | None, tell: Teller) -> Apparatus:
-    """Return what the steps act on, with the bench's look-ahead and frames."""
-    return Apparatus(stage, pump, tell, bench.limits.look_ahead_um * 1e-6, bench.daq.frame_s)
+    """Return what the steps act on, with the bench's look-ahead, frames and load cell."""
+    return Apparatus(
+        stage,
+        pump,
+        tell,
+        look_ahead=bench.limits.look_ahead_um * 1e-6,
+        frame=bench.daq.frame_s,
+        room=lambda force: room_um(bench, force) * 1e-6,
+    )
 
 
 def build_steps(scene: Scene, apparatus: Apparatus, hands: str = "") -> list[Step]:

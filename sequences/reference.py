@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from sequences.errors import StepFailed
 from sequences.frame import Frame
@@ -21,15 +21,12 @@ class Parking:
         Height, m; ``None`` is the highest allowed.
     speed
         m/s, at most.
-    look_ahead
-        m, at most.
     touch
         Change of force that is taken for a touch, N.
     """
 
     start: float | None
     speed: float
-    look_ahead: float
     touch: float
 
 
@@ -49,7 +46,6 @@ def reference(apparatus: Apparatus, parking: Parking) -> list[Step]:
             f"start_mm = {start * 1e3:g} lies outside the stage's travel of {low * 1e3:g} to {high * 1e3:g} mm",
             "correct start_mm in the bench file",
         )
-    careful = replace(apparatus, look_ahead=min(apparatus.look_ahead, parking.look_ahead))
 
     def seek(frame: Frame) -> Steps:
         stage = apparatus.stage
@@ -79,6 +75,6 @@ def reference(apparatus: Apparatus, parking: Parking) -> list[Step]:
                     "take specimen and gripper out of the stage's path, or correct start_mm in the bench file",
                 )
 
-        return travel(careful, start, parking.speed, "park", frame, watch)
+        return travel(apparatus, start, parking.speed, "park", frame, watch)
 
     return [Step("reference", "the switch is found", seek), Step("park", "at the starting height", park)]

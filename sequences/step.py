@@ -6,10 +6,13 @@ A step is a generator: it commands the stage or the pump, then ``frame = yield``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
+
+import numpy as np
 
 from drivers.interfaces import Pump, Stage
 from sequences.errors import StepFailed
@@ -53,6 +56,8 @@ class Apparatus:
         A move under way is never commanded further than this beyond the present position, m (dead man).
     frame
         Usual length of a frame, s.
+    room
+        How far the stage may go on from a force (N, a magnitude) against something rigid, m.
     """
 
     stage: Stage
@@ -60,6 +65,11 @@ class Apparatus:
     tell: Teller
     look_ahead: float = 50e-6
     frame: float = 20e-3
+    room: Callable[[float], float] = lambda force: math.inf
+
+    def ahead(self, frame: Frame) -> float:
+        """Return how far ahead of its position the stage may be commanded, m: the cell outlives this program."""
+        return min(self.look_ahead, max(0.0, self.room(float(np.abs(frame.force).max()))))
 
 
 @dataclass(frozen=True)
@@ -122,9 +132,8 @@ class Motion:
 
     _RESOLUTION = 1e-6
 
-    def __init__(self, apparatus: Apparatus, target: float, speed: float, *, look_ahead: float | None = None) -> None:
+    def __init__(self, apparatus: Apparatus, target: float, speed: float) -> None:
         self._apparatus = apparatus
-        self._look_ahead = apparatus.look_ahead if look_ahead is None else look_ahead
         self._target = target
         self._commanded: float | None = None
         self._speed = speed
@@ -144,7 +153,7 @@ class Motion:
 
     def extend(self, frame: Frame) -> None:
         """Command the next stretch when half of the last one has been travelled."""
-        position, ahead = frame.stage.position, self._look_ahead
+        position, ahead = frame.stage.position, self._apparatus.ahead(frame)
         if self._is_due(frame, position, ahead):
             low, high = self._apparatus.stage.travel
             way = min(max(self._target, low), high) - position
@@ -186,7 +195,7 @@ def travel(
     StepFailed
         It takes much longer than it should.
     """
-    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.look_ahead, apparatus.frame)))
+    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.ahead(frame), apparatus.frame)))
     left = (3 * abs(target - frame.stage.position) / motion.speed + 5) * frame.rate
     try:
         while not motion.arrived(frame):

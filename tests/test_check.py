@@ -13,7 +13,7 @@ from conftest import scene_text
 import rig.emulation
 from drivers.emulated.chamber import Chamber
 from drivers.emulated.faults import Fault, Faults
-from drivers.emulated.specimens import RigidStop
+from drivers.emulated.specimens import RigidStop, finish
 from drivers.emulated.truth import Train, Truth
 from rig.bench import OVERLOAD, load_bench, parse_bench
 from rig.calibrate import calibrate
@@ -21,6 +21,7 @@ from rig.campaign import Campaign
 from rig.check import STIFFEST_UM_PER_N, reasons
 from rig.errors import FileError
 from rig.instruments import sensor_converter
+from rig.observe import Watcher
 from rig.recording import load_recording
 from rig.scene import parse_scene
 from rig.session import run_scene
@@ -189,6 +190,48 @@ def test_a_retraction_faster_than_the_tension_limit_can_stop_is_refused():
         in told
     )
     assert "lower tension_N" in told
+
+
+@dataclasses.dataclass(frozen=True)
+class Bond(RigidStop):
+    """A stop that never lets go once it has been touched (``radius`` of the state says so)."""
+
+    def step(self, state, duration, around):
+        touched = state.radius > 0 or around.height <= 0
+        series = around.stiffness * self.stop_stiffness / (around.stiffness + self.stop_stiffness)
+        force = -around.height * series if touched else 0.0
+        height = around.height + force / around.stiffness
+        return finish(state, duration, force, around.closed_pressure, height, float(touched), 0.0, 0.0)
+
+
+@pytest.mark.parametrize("level", [-1.0, -3.0, -4.3])
+def test_a_cell_outlives_a_rigid_bond_whose_stage_is_unplugged(request_for, monkeypatch, level):
+    world = Truth(Bond(), Chamber(vented=True), Train(start_position=20.1e-3))
+    plants, make = [], rig.emulation.emulated_bench
+    faults = Faults([Fault("stage", "unplugged", at_sample=10**9)])
+
+    def emulated(request):
+        made = make(request)
+        plants.append(made.plant)
+        return made
+
+    class Unplug(Watcher):
+        def frame(self, frame):
+            if frame.force.min() < level:
+                faults.add(Fault("stage", "unplugged"))
+
+    monkeypatch.setattr(rig.emulation, "truth", lambda scene, seed: world)
+    monkeypatch.setattr(rig.emulation, "emulated_bench", emulated)
+    scene = scene_text("punch", preload_N=0.5, preload_dwell_s=0.2, tare_s=0.5, retract_speed_um_s=50.0)
+    text = changed(("start_mm = 22.0", "start_mm = 20.1\nleft_on = true"))
+    request = dataclasses.replace(
+        request_for(), scene=parse_scene(scene, "scene"), scene_text=scene, bench=parse_bench(text, "bench"),
+        bench_text=text, faults=faults, observers=[Unplug()],
+    )  # fmt: skip
+    assert run_scene(request).exit_code in (3, 6)  # the limit or the stage, whichever is found first
+    least = min(float(plants[0].advance(100, 1000.0)["force"].min()) for _ in range(100))
+    assert not plants[0].axis.moving
+    assert level > least > -OVERLOAD * request.bench.force.capacity_N
 
 
 def test_a_tare_of_few_frames_is_refused():
