@@ -120,10 +120,10 @@ def _with_setting(run: Run, key: str, value: float, change: float) -> Run:
 def _bent(work: Extraction, uncertainty: float) -> Array:
     """A calibration curve that is out by ``uncertainty``, with the sign of the load.
 
-    It is right at zero, and out in full from about one per cent of the cell's capacity on: the smallest weight of its
-    calibration. Where no capacity is known that of the largest force counts.
+    It is right at zero, and out by nine tenths of that at one per cent of the cell's capacity: the smallest weight of
+    its calibration. Where no capacity is known the largest force stands for it.
     """
-    scale = 0.01 * (work.run.sensors.force_capacity or max(float(np.abs(work.force).max()), 1e-12))
+    scale = 0.007 * (work.run.sensors.force_capacity or max(float(np.abs(work.force).max()), 1e-12))
     return np.asarray(work.run.force + uncertainty * np.tanh(work.force / scale), dtype=np.float64)
 
 

@@ -139,7 +139,9 @@ def test_contact_point_carries_the_spread_of_its_methods() -> None:
     analysis = analyze(quiet_run()[0])
     contact = analysis.features["contact_height_m"]
     assert len(analysis.work.methods["contact_height_m"]) >= 3
-    assert contact.budget["contact point"] == pytest.approx(analysis.features.value("contact_spread_m"))
+    spread = analysis.features.value("contact_spread_m")
+    cell = float(np.ptp(np.asarray(analysis.work.details["contact"]["separation"])[:2]))
+    assert contact.budget["contact point"] == pytest.approx(np.hypot(spread, cell / np.sqrt(12)))
     assert contact.value == pytest.approx(5e-3, abs=3 * contact.uncertainty + 1e-5)
 
 
