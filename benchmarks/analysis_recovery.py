@@ -36,7 +36,7 @@ from model.jkr import work_of_adhesion_jkr
 from rig.bench import Bench, load_bench, parse_bench
 from rig.emulation import truth as emulated_truth
 from rig.measured import load_run, sensors
-from rig.observe import Watcher
+from rig.observe import Observer
 from rig.scene import Scene, parse_scene
 from rig.session import Request, run_scene
 from sequences.frame import Frame
@@ -170,7 +170,7 @@ def instruments(bench: Bench, draw: Random) -> Device:
 
 
 @dataclass
-class Witness(Watcher):
+class Witness(Observer):
     """Keeps every knot of the plant: time, force on the sample, height, pressure, contact radius, force at the cell."""
 
     plant: Plant

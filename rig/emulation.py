@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rig.observe import Controls, Event, Watcher
+from rig.observe import Controls, Event, Observer
 
 if TYPE_CHECKING:
     from drivers.emulated.bench import EmulatedBench
@@ -100,7 +100,7 @@ def weights(scene: Scene) -> list[float]:
     )
 
 
-class Hands(Watcher):
+class Hands(Observer):
     """The emulated operator: hangs the next mass (kg), if any, whenever a prompt asks, and lets the run go on."""
 
     def __init__(self, controls: Controls, world: EmulatedBench, masses: Iterable[float] = ()) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from drivers.interfaces import Clock, Daq, Pump, Stage
 from rig.bench import EMULATED, Bench
 from rig.converter import SensorConverter
-from rig.observe import Observer, StepEvent, StepPhase, Watcher
+from rig.observe import Observer, StepEvent, StepPhase
 from rig.safe_state import release
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Opened:
         }
 
 
-class _StepsToFaults(Watcher):
+class _StepsToFaults(Observer):
     """Tells the emulated bench which step has begun, for fault scripts."""
 
     def __init__(self, emulated: EmulatedBench) -> None:

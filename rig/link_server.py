@@ -16,7 +16,7 @@ from typing import Any, Self
 from drivers.errors import DeviceError
 from rig.link_address import Address, LinkError, address_file, publish
 from rig.link_proof import admit, hang_up, receive_text
-from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, Watcher
+from rig.observe import Controls, Ending, Event, Observer, RunInfo, StepEvent, StepPhase
 from rig.wire import Gap, Message, encode, samples_of
 from sequences.frame import Frame
 
@@ -78,7 +78,7 @@ class _Log:
             return cursor, missed, None
 
 
-class LinkServer(Watcher):
+class LinkServer(Observer):
     """An observer that shows the run to every console and takes the commands of one.
 
     Parameters

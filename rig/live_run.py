@@ -20,7 +20,7 @@ from model.parameters import Parameters
 from rig.live import UPDATES, LivePredictor
 from rig.live_data import Gathering, Glance
 from rig.live_prediction import LivePrediction
-from rig.observe import Ending, StepEvent, StepPhase, Watcher
+from rig.observe import Ending, Observer, StepEvent, StepPhase
 from sequences.frame import Frame
 
 MOST_WAITING = 50_000
@@ -46,7 +46,7 @@ class Maker(Protocol):
         ...
 
 
-class Live(Watcher):
+class Live(Observer):
     """The observer. ``tell`` is called on the loop's thread (``Reporter.prediction``)."""
 
     def __init__(self, maker: Maker, tell: Tell) -> None:

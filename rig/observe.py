@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any
 
 from sequences.frame import Frame
 
@@ -109,54 +109,26 @@ class Ending:
     features: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Observer(Protocol):
-    """Told of everything on the loop's thread; must never block it. An observer that raises is dropped, loudly."""
+class Observer:
+    """Told of everything on the loop's thread; overrides what it needs. It must not block; one that raises is dropped."""
 
     def started(self, info: RunInfo) -> None:
         """The instruments are open, the stage is referenced; no step has begun."""
-        ...
 
     def frame(self, frame: Frame) -> None:
         """A frame has been checked and recorded."""
-        ...
 
     def step(self, event: StepEvent) -> None:
         """A step began, got on or ended."""
-        ...
 
     def event(self, event: Event) -> None:
         """A line for the log."""
-        ...
 
     def prediction(self, prediction: Any) -> None:
         """A live prediction (``rig.live_prediction.LivePrediction``)."""
-        ...
 
     def finished(self, ending: Ending) -> None:
         """Everything has been stopped and the recording closed."""
-        ...
-
-
-class Watcher:
-    """An observer that ignores everything; override what you need."""
-
-    def started(self, info: RunInfo) -> None:
-        """See ``Observer``."""
-
-    def frame(self, frame: Frame) -> None:
-        """See ``Observer``."""
-
-    def step(self, event: StepEvent) -> None:
-        """See ``Observer``."""
-
-    def event(self, event: Event) -> None:
-        """See ``Observer``."""
-
-    def prediction(self, prediction: Any) -> None:
-        """See ``Observer``."""
-
-    def finished(self, ending: Ending) -> None:
-        """See ``Observer``."""
 
 
 class Wish(StrEnum):

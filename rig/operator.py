@@ -9,7 +9,7 @@ import threading
 from typing import TextIO
 
 from rig.errors import Refused
-from rig.observe import Controls, Event, Watcher
+from rig.observe import Controls, Event, Observer
 from rig.voice import Voice
 
 
@@ -87,7 +87,7 @@ class Keyboard:
             controls.resume()
 
 
-class Prompts(Watcher):
+class Prompts(Observer):
     """Answers the prompts of one run from the keyboard; where consoles can attach, their button works as well."""
 
     def __init__(self, keyboard: Keyboard, controls: Controls, voice: Voice, *, linked: bool = False) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from rig.observe import Ending, Event, RunInfo, StepEvent, StepPhase, Watcher
+from rig.observe import Ending, Event, Observer, RunInfo, StepEvent, StepPhase
 from rig.voice import Voice
 
 _SCALES = {"N": ("N", 1.0), "Pa": ("kPa", 1e-3), "s": ("s", 1.0), "m": ("mm", 1e3)}
 _SHOWN = {"warning", "fault", "interlock", "operator", "prompt"}
 
 
-class Terminal(Watcher):
+class Terminal(Observer):
     """Writes to standard error; on a terminal the running step's line is rewritten in place."""
 
     def __init__(self, voice: Voice | None = None) -> None:

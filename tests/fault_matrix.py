@@ -29,7 +29,7 @@ import rig.session
 from drivers.emulated.bench import EmulatedBench, Endpoints
 from drivers.emulated.faults import Fault, Faults
 from rig.bench import load_bench
-from rig.observe import Controls, Ending, StepPhase, Watcher
+from rig.observe import Controls, Ending, Observer, StepPhase
 from rig.recorder import Recorder
 from rig.recording import load_recording
 from rig.scene import Scene
@@ -287,7 +287,7 @@ class _Terminals(EmulatedBench):
         return dataclasses.replace(super().endpoints, stage=stage, pump=pump)
 
 
-class _Act(Watcher):
+class _Act(Observer):
     """Does what the trouble says, some frames into its step."""
 
     def __init__(self, trouble: Trouble, step: str, stage: Stage) -> None:

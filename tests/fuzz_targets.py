@@ -40,7 +40,7 @@ from rig.errors import FileError, Refused
 from rig.fault_script import load_faults
 from rig.journal import _MAGIC, journal_of
 from rig.measured import as_run
-from rig.observe import Controls, Watcher
+from rig.observe import Controls, Observer
 from rig.recording import _load, load_recording
 from rig.recording_file import entry_of
 from rig.recovery import recover
@@ -291,7 +291,7 @@ def _scratch() -> Path:
 def _sound() -> Path:
     """A short recording."""
 
-    class Stop(Watcher):
+    class Stop(Observer):
         def frame(self, frame: Any) -> None:
             if frame.stop >= 200:
                 controls.stop()

@@ -10,7 +10,7 @@ from conftest import scene_text
 from dead_man import PROTOCOL, bench_file, emulators
 
 from rig.bench import load_bench
-from rig.observe import Ending, StepPhase, Watcher
+from rig.observe import Ending, Observer, StepPhase
 from rig.scene import Scene
 from rig.session import Request, run_scene
 
@@ -18,7 +18,7 @@ AHEAD = 120
 """Samples between the command and the trip, so that it comes in the middle of a run that has settled."""
 
 
-class _Trip(Watcher):
+class _Trip(Observer):
     """Asks for the trip some frames into the approach."""
 
     def __init__(self, command, ahead: int) -> None:

@@ -21,7 +21,7 @@ from rig.campaign import Campaign
 from rig.check import STIFFEST_UM_PER_N, reasons
 from rig.errors import FileError
 from rig.instruments import sensor_converter
-from rig.observe import Watcher
+from rig.observe import Observer
 from rig.recording import load_recording
 from rig.scene import parse_scene
 from rig.session import run_scene
@@ -215,7 +215,7 @@ def test_a_cell_outlives_a_rigid_bond_whose_stage_is_unplugged(request_for, monk
         plants.append(made.plant)
         return made
 
-    class Unplug(Watcher):
+    class Unplug(Observer):
         def frame(self, frame):
             if frame.force.min() < level:
                 faults.add(Fault("stage", "unplugged"))

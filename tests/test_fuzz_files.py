@@ -115,11 +115,11 @@ def recorded(tmp_path_factory):
     bench, bench_text = load_bench(None)
     text = scene_text("sphere-60mm-vented", tare_s=0.5)
     path = tmp_path_factory.mktemp("recorded") / "run.h5"
-    from rig.observe import Controls, Watcher
+    from rig.observe import Controls, Observer
 
     controls = Controls()
 
-    class Stop(Watcher):
+    class Stop(Observer):
         def frame(self, frame):
             if frame.stop > 2000:
                 controls.stop()

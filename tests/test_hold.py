@@ -8,7 +8,7 @@ from conftest import SHORT, scene_text
 
 from rig.bench import parse_bench
 from rig.library import find
-from rig.observe import Controls, StepPhase, Watcher
+from rig.observe import Controls, Observer, StepPhase
 from rig.recording import load_recording
 from rig.replay import Pace
 from rig.replay_session import replay
@@ -20,7 +20,7 @@ LONG = 25_000
 QUICK = {"preload_dwell_s": 0.5, "tare_s": 0.5}
 
 
-class Holder(Watcher):
+class Holder(Observer):
     """Holds every step once, so many samples after its beginning, and resumes."""
 
     def __init__(self, controls, length, delay):

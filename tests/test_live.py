@@ -21,7 +21,7 @@ from rig.live_data import GONE, Evidence, Gathering, Glance
 from rig.live_fit import Doubt, Estimator, Kernel, mend
 from rig.live_prediction import LivePrediction
 from rig.live_run import Again, Beside, Inline, live
-from rig.observe import Ending, StepEvent, StepPhase, Watcher
+from rig.observe import Ending, Observer, StepEvent, StepPhase
 from rig.session import Request, run_scene
 
 RATE, SAMPLES = 1000.0, 20
@@ -334,7 +334,7 @@ def test_a_run_records_what_it_announced(request_for: Callable[..., Request]) ->
 
     told: list[LivePrediction] = []
 
-    class Witness(Watcher):
+    class Witness(Observer):
         def prediction(self, prediction: LivePrediction) -> None:
             told.append(prediction)
 

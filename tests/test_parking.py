@@ -14,7 +14,7 @@ from drivers.emulated.truth import Train, Truth
 from rig.bench import OVERLOAD, load_bench, parse_bench
 from rig.check import parking
 from rig.errors import FileError
-from rig.observe import Controls, Watcher
+from rig.observe import Controls, Observer
 from rig.session import reference_only, run_scene
 from sequences.errors import StepFailed
 
@@ -101,7 +101,7 @@ def test_what_is_in_the_way_ends_the_parking_and_survives(request_for, monkeypat
 def test_a_reference_move_is_taken_up_again_after_a_hold(request_for):
     controls = Controls()
 
-    class Hold(Watcher):
+    class Hold(Observer):
         frames = 0
 
         def frame(self, frame):

@@ -12,14 +12,14 @@ from power_cut import Disk, watched
 
 from rig.errors import FileError
 from rig.journal import journal_of
-from rig.observe import Controls, Watcher
+from rig.observe import Controls, Observer
 from rig.recording import Recording, load_recording
 from rig.session import Request, run_scene
 
 Cuts = tuple[Disk, Recording]
 
 
-class _StopAfter(Watcher):
+class _StopAfter(Observer):
     """The operator ends the run after so many samples: the disk is looked at often, and slowly."""
 
     def __init__(self, controls: Controls, samples: int) -> None:

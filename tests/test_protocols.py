@@ -18,7 +18,7 @@ from rig.check import check
 from rig.cli import main
 from rig.errors import Refused
 from rig.measured import load_run
-from rig.observe import StepPhase, Watcher
+from rig.observe import Observer, StepPhase
 from rig.recording import load_recording
 from rig.scene import parse_scene
 from rig.session import Request, run_scene
@@ -28,7 +28,7 @@ COVERAGE = 3.0
 """Results must lie within so many of their standard uncertainties of the truth."""
 
 
-class Witness(Watcher):
+class Witness(Observer):
     """Sees the plant's true force at the end of every frame, as no instrument does."""
 
     def __init__(self) -> None:

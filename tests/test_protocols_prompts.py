@@ -11,7 +11,7 @@ from conftest import scene_text
 
 from rig.bench import load_bench
 from rig.errors import Refused
-from rig.observe import Controls, Event, Watcher, Wish
+from rig.observe import Controls, Event, Observer, Wish
 from rig.operator import Keyboard, Prompts
 from rig.recording import load_recording
 from rig.scene import parse_scene
@@ -110,7 +110,7 @@ def test_a_run_waits_at_a_prompt_and_keeps_recording(tmp_path, line, monkeypatch
     keyboard, press = line
     controls = Controls()
 
-    class Operator(Watcher):
+    class Operator(Observer):
         """Takes half a second of the bench's time over everything."""
 
         asked_at = None
@@ -124,7 +124,7 @@ def test_a_run_waits_at_a_prompt_and_keeps_recording(tmp_path, line, monkeypatch
                 self.asked_at = None
                 press.write("\n")
 
-    monkeypatch.setattr("rig.emulation.Hands.event", Watcher.event)
+    monkeypatch.setattr("rig.emulation.Hands.event", Observer.event)
     bench, bench_text = load_bench(None)
     text = scene_text("pressure-zero", rest_s=0.5)
     observers = [Prompts(keyboard, controls, Voice()), Operator()]

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from rig.errors import BeingWritten, FileError
 from rig.layout import EVENTS, pieces
-from rig.observe import Watcher
+from rig.observe import Observer
 from rig.recorder import Recorder
 from rig.recording import load_recording, open_recording
 from rig.recovery import recover
@@ -154,7 +154,7 @@ def test_a_run_ends_before_its_file_is_as_large_as_it_may_be(tmp_path):
         assert file["entry/ending"][0]["exit_code"] == 2
 
 
-class _Once(Watcher):
+class _Once(Observer):
     """Does something once, some frames into the run."""
 
     def __init__(self, act):

@@ -16,7 +16,7 @@ from rig.bench import parse_bench
 from rig.emulation import truth
 from rig.errors import FileError, Refused
 from rig.measured import load_run
-from rig.observe import Controls, StepPhase, Watcher
+from rig.observe import Controls, Observer, StepPhase
 from rig.recorder import Recorder
 from rig.recording import load_recording
 from rig.replay import Pace
@@ -97,7 +97,7 @@ def test_replay_sees_a_changed_bit(request_for):
     assert replay(load_recording(request.out), pace=Pace()).differences
 
 
-class StopIn(Watcher):
+class StopIn(Observer):
     """Asks for something when a step begins."""
 
     def __init__(self, controls, step, wish):
@@ -121,7 +121,7 @@ def test_the_operator_can_end_any_run(request_for, wish):
 
 
 def test_ctrl_c_ends_the_run_in_good_order(request_for):
-    class Press(Watcher):
+    class Press(Observer):
         def step(self, event):
             if event.phase is StepPhase.STARTED and event.name == "preload":
                 signal.raise_signal(signal.SIGINT)
@@ -265,7 +265,7 @@ def test_a_pressure_that_does_not_follow_the_pump_ends_the_run_after_one_stroke(
 
 
 def test_an_observer_that_fails_harms_nothing(request_for):
-    class Broken(Watcher):
+    class Broken(Observer):
         def frame(self, frame):
             raise RuntimeError("painting failed")
 
