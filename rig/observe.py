@@ -110,7 +110,7 @@ class Ending:
 
 
 class Observer:
-    """Told of everything on the loop's thread; overrides what it needs. It must not block; one that raises is dropped."""
+    """Told of everything on the loop's thread; overrides what it needs. It must not block; who raises is dropped."""
 
     def started(self, info: RunInfo) -> None:
         """The instruments are open, the stage is referenced; no step has begun."""
