@@ -34,8 +34,8 @@ class Sensors:
     force_linearity, pressure_offset
         Standard uncertainty in N and Pa.
     force_capacity
-        Of the load cell, N; 0: not known. What its calibration line is out by grows with the load from zero and is
-        fully there at about one per cent of the capacity, the smallest weight of a calibration.
+        Of the load cell, N; 0: not known. What its calibration line is out by grows with the load from zero; nine
+        tenths of it are there at one per cent of the capacity, about the smallest weight of a calibration.
     position
         Standard uncertainty of the stage's position scale, relative.
     pump_volume
