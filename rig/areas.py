@@ -32,7 +32,7 @@ def read_areas(path: Path) -> Areas:
     Parameters
     ----------
     path
-        CSV with a header: ``recording`` (name, with or without ``.h5``) and any columns of ``SETTINGS``. Empty cells
+        CSV with a header: ``recording`` (its name in the analysis, with or without ``.h5``) and any columns of ``SETTINGS``. Empty cells
         say nothing; of two lines for one recording the later adds to the earlier.
 
     Raises
@@ -54,7 +54,7 @@ def read_areas(path: Path) -> Areas:
         where = f"{path}, line {lines.line_num}"
         if None in cells:
             raise FileError(f"{where}: more cells than columns. Remedy: write the decimal point as a point")
-        name = Path((cells["recording"] or "").strip()).name.removesuffix(".h5")
+        name = (cells["recording"] or "").strip().removesuffix(".h5")
         settings = {SETTINGS[key]: _area(f"{where}, {key}", text) for key, text in cells.items() if _given(key, text)}
         if not name:
             raise FileError(f"{where}: names no recording. Remedy: write its file name into the column recording")
