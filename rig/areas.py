@@ -32,8 +32,8 @@ def read_areas(path: Path) -> Areas:
     Parameters
     ----------
     path
-        CSV with a header: ``recording`` (its name in the analysis, with or without ``.h5``) and any columns of ``SETTINGS``. Empty cells
-        say nothing; of two lines for one recording the later adds to the earlier.
+        CSV with a header: ``recording`` (its name in the analysis, with or without ``.h5``) and any columns of
+        ``SETTINGS``. Empty cells say nothing; of two lines for one recording the later adds to the earlier.
 
     Raises
     ------

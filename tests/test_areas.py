@@ -23,14 +23,14 @@ def test_each_recording_gets_its_own_area(tmp_path: Path) -> None:
     path = written(
         tmp_path,
         "recording, area_mm2, uncertainty_mm2, real_um2, projected_um2\n"
-        "left.h5, 0.78, 0.02,,\nright, 0.76,,,\nmonday/left, 0.7,,,\nspl-1,,,12787.0,20687.3\nleft,0.79,,,\n",
+        "left.h5, 0.78, 0.02,,\nright, 0.76,,,\nmonday-left, 0.7,,,\nspl-1,,,12787.0,20687.3\nleft,0.79,,,\n",
     )
     areas = read_areas(path)
     assert areas["left"] == {"contact_area_mm2": 0.79, "contact_area_uncertainty_mm2": 0.02}
     assert areas["right"] == {"contact_area_mm2": 0.76}
     assert areas["spl-1"] == {"real_area_um2": 12787.0, "projected_area_um2": 20687.3}
-    assert areas["monday/left"] == {"contact_area_mm2": 0.7}  # as the analysis names one of two of the same name
-    assert strangers(areas, ["left", "monday/left", "spl-1"]) == ["right"]
+    assert areas["monday-left"] == {"contact_area_mm2": 0.7}  # as the analysis names one of two of the same name
+    assert strangers(areas, ["left", "monday-left", "spl-1"]) == ["right"]
     run, _ = pull_off_run(Profile.jkr(4.0, 4e-3, 2e6, 0.095))
     assert with_area(run, areas) is run
     assert with_area(run, {run.name: areas["right"]}).settings["contact_area_mm2"] == 0.76
