@@ -27,6 +27,9 @@ INBOX_FRAMES = 20_000
 BATCH_S = 1 / 60
 """The link gathers frames for so long before it sends them: consoles paint no faster."""
 
+DRAIN_S = 5.0
+"""What consoles get to attach and to take the rest when a run is over."""
+
 NAME_VARIABLE = "RIG_LINK_NAME"
 """Environment variable with the name a console gives to the run it starts, to find it again."""
 
@@ -96,6 +99,8 @@ class LinkServer(Observer):
 
     def __init__(self, controls: Controls, *, name: str | None = None, memory: int = HISTORY_BYTES) -> None:
         self._controls = controls
+        self._awaited = name is None and NAME_VARIABLE in os.environ
+        self._attached = threading.Event()
         self._name = name or os.environ.get(NAME_VARIABLE) or f"run-{os.getpid()}"
         self._inbox: deque[Frame | Message] = deque()
         self._arrived = threading.Event()
@@ -151,8 +156,13 @@ class LinkServer(Observer):
 
     # -- life
 
-    def close(self, drain_s: float = 1.0) -> None:
-        """Give consoles up to ``drain_s`` to take the rest, then hang up. A frozen console cannot delay it longer."""
+    def close(self, drain_s: float = DRAIN_S) -> None:
+        """Give consoles up to ``drain_s`` to take the rest, then hang up. A frozen console cannot delay it longer.
+
+        The console that has started this run is waited for as long, should the run be over before it could attach.
+        """
+        if self._awaited:
+            self._attached.wait(drain_s)
         self._closing.set()
         self._arrived.set()
         self._packer.join()
@@ -243,6 +253,8 @@ class LinkServer(Observer):
             admit(connection, self.address.key)
             hello = json.loads(receive_text(connection))
             role, who = str(hello["role"]), str(hello["who"])
+            if role == "emergency":  # the last of a console's connections
+                self._attached.set()
             if role == "watch":
                 self._show(connection, who)
             else:

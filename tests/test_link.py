@@ -253,6 +253,23 @@ def test_a_damaged_address_file_is_named(runtime: Path) -> None:
         addresses.running()
 
 
+def test_a_run_that_is_over_at_once_waits_for_the_console_that_started_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(link_server.NAME_VARIABLE, "console-1")
+    server = LinkServer(Controls())
+    server.started(run_info())
+    server.finished(Ending("done", 0, 0))
+    closing = threading.Thread(target=server.close)
+    closing.start()
+    time.sleep(0.3)
+    address = addresses.find("console-1")
+    assert address is not None
+    link = Link(address)
+    assert take_until(link, Ending)
+    closing.join()
+    assert addresses.running() == []
+    link.close()
+
+
 def test_a_run_has_a_plain_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(link_server.NAME_VARIABLE, "../elsewhere")
     with pytest.raises(LinkError, match="no name for a run"):

@@ -587,10 +587,10 @@ class Console(QMainWindow):
         """The run has hung up. A replay stays; of a repeated run the next test may come."""
         self._detach()
         story = self.story
-        if not self._replaying and story is not None and story.ending is None:
-            self._say_fault(
-                "The run has hung up without saying why. Remedy: read its output, then `rig recover` the file."
-            )
+        if story is None or story.ending is None:
+            remedy = "open it again" if self._replaying else "read its output, then `rig recover` the file"
+            what = "replay" if self._replaying else "run"
+            self._say_fault(f"The {what} has hung up without saying why. Remedy: {remedy}.")
             self._set_state("link lost", "fault")
         self._offer()
 
