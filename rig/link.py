@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection
 
 from rig.link_address import Address, LinkError, forget
-from rig.link_proof import TEXT_BYTES, hang_up, prove
+from rig.link_proof import READY, TEXT_BYTES, hang_up, prove, receive
 from rig.observe import Event
 from rig.wire import BadMessage, Message, decode
 
@@ -74,6 +74,7 @@ class Link:
         try:
             prove(connection, self.address.key)
             connection.send_bytes(json.dumps({"role": role, "who": self._who}).encode())
+            receive(connection, len(READY))
         except (EOFError, OSError) as error:
             connection.close()
             raise LinkError(f"link: run {self.address.name} hung up ({error}). Remedy: attach again.") from error

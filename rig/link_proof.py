@@ -13,13 +13,22 @@ from rig.link_address import LinkError
 
 HANDSHAKE_S = 2.0
 TEXT_BYTES = 4096
+READY = b"ready"
+"""The run's word that a connection is known: a console that has heard it thrice will be told all."""
 
 
 def _proof(key: bytes, role: bytes, *nonces: bytes) -> bytes:
     return hmac.digest(key, b"".join([role, *nonces]), "sha256")
 
 
-def _receive(connection: Connection, length: int) -> bytes:
+def receive(connection: Connection, length: int) -> bytes:
+    """Return so many bytes of the handshake.
+
+    Raises
+    ------
+    LinkError
+        They do not come in time, or others come.
+    """
     if not connection.poll(HANDSHAKE_S):
         raise LinkError("link: the other end is silent. Remedy: check that it is a run of this program.")
     data = connection.recv_bytes(length)
@@ -38,7 +47,7 @@ def admit(connection: Connection, key: bytes) -> None:
     """
     ours = secrets.token_bytes(32)
     connection.send_bytes(ours)
-    answer = _receive(connection, 64)
+    answer = receive(connection, 64)
     theirs, proof = answer[:32], answer[32:]
     if not hmac.compare_digest(proof, _proof(key, b"console", ours, theirs)):
         raise LinkError("link: a peer without the key was refused.")
@@ -47,10 +56,10 @@ def admit(connection: Connection, key: bytes) -> None:
 
 def prove(connection: Connection, key: bytes) -> None:
     """Run the console's side of the mutual proof; the run must prove the key as well."""
-    theirs = _receive(connection, 32)
+    theirs = receive(connection, 32)
     ours = secrets.token_bytes(32)
     connection.send_bytes(ours + _proof(key, b"console", theirs, ours))
-    if not hmac.compare_digest(_receive(connection, 32), _proof(key, b"run", ours, theirs)):
+    if not hmac.compare_digest(receive(connection, 32), _proof(key, b"run", ours, theirs)):
         raise LinkError("link: the other end does not hold the key; it is not the run. Remedy: attach again.")
 
 

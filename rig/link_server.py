@@ -15,7 +15,7 @@ from typing import Any, Self
 
 from drivers.errors import DeviceError
 from rig.link_address import Address, LinkError, address_file, publish
-from rig.link_proof import admit, hang_up, receive_text
+from rig.link_proof import READY, admit, hang_up, receive_text
 from rig.observe import Controls, Ending, Event, Observer, RunInfo, StepEvent, StepPhase
 from rig.wire import Gap, Message, encode, samples_of
 from sequences.frame import Frame
@@ -271,6 +271,7 @@ class LinkServer(Observer):
         log = self._log
         self._behind[who] = True
         try:
+            connection.send_bytes(READY)
             while True:
                 cursor, missed, data = log.next(cursor)
                 if missed:
@@ -290,6 +291,7 @@ class LinkServer(Observer):
             self._behind.pop(who, None)
 
     def _listen(self, connection: Connection, who: str) -> None:
+        connection.send_bytes(READY)
         try:
             while True:
                 command = receive_text(connection)

@@ -25,6 +25,8 @@ def main() -> None:
 
     def until(condition: Callable[[], object]) -> None:
         while not condition():
+            if window.state.text() in ("failed", "link lost"):
+                raise RuntimeError(window.banner.text())
             application.processEvents()
             time.sleep(0.002)
 

@@ -25,6 +25,7 @@ from rig import link_address as addresses
 from rig import link_server, wire
 from rig.link import Link
 from rig.link_address import Address, LinkError
+from rig.link_proof import receive_text
 from rig.link_server import LinkServer
 from rig.live_prediction import Estimate, LivePrediction
 from rig.observe import Controls, Ending, Event, RunInfo, StepEvent, StepPhase, StepPlan, Wish
@@ -253,7 +254,17 @@ def test_a_damaged_address_file_is_named(runtime: Path) -> None:
         addresses.running()
 
 
-def test_a_run_that_is_over_at_once_waits_for_the_console_that_started_it(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("slow_s", [0.0, 0.5])
+def test_a_run_that_is_over_at_once_waits_for_the_console_that_started_it(
+    slow_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    delays = [slow_s]  # of the thread that is to show the run
+
+    def hear(connection: Any) -> str:
+        time.sleep(delays.pop() if delays else 0.0)
+        return receive_text(connection)
+
+    monkeypatch.setattr(link_server, "receive_text", hear)
     monkeypatch.setenv(link_server.NAME_VARIABLE, "console-1")
     server = LinkServer(Controls())
     server.started(run_info())
