@@ -145,7 +145,7 @@ def _largest_source(quantity: Quantity) -> str:
 
 
 STYLE = """
-body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;background:#fff;max-width:66rem;margin:2rem auto;padding:0
+body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;background:#fff;max-width:74rem;margin:2rem auto;padding:0
 1.2rem} h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.2rem;margin-top:2.4rem;border-bottom:1px solid #ccc}
 h3{font-size:1.08rem;margin:2rem 0 .4rem}h4{font-size:1rem;margin:1.4rem 0 .4rem}
 .warning{border-left:4px solid #D55E00;padding:.3rem .8rem;background:#fdf1ea;font-weight:600}
