@@ -121,6 +121,9 @@ def world(scene: Scene, bench: Bench, draw: Random, seed: int) -> Truth:
     if hasattr(specimen, "line"):
         receding = draw.uniform(2.0, 5.0)
         specimen = replace(specimen, line=replace(specimen.line, receding=receding))  # type: ignore[type-var]
+    if hasattr(specimen, "sphere_radius"):
+        error = getattr(scene.protocol, "indenter_radius_uncertainty_mm", 0.0) * 1e-3 * draw.normal()
+        specimen = replace(specimen, sphere_radius=specimen.sphere_radius + error)  # type: ignore[type-var]
     stiffness = 1 / (known.compliance + known.compliance_uncertainty * draw.normal())
     assert bench.pump is not None
     syringe = bench.pump.syringe_diameter_mm * 1e-3 * (1 + known.pump_volume / 2 * draw.normal())
