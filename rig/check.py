@@ -215,7 +215,7 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
             "run the scene `compliance` and enter its result"
         ]
     limits, preload = bench.limits, protocol.preload_N
-    reaction = bench.daq.frame_s + REACTION_S
+    reaction = reaction_s(bench)
     found = _too_fast(
         "approach_speed_um_s",
         protocol.approach_speed_um_s,
@@ -239,7 +239,7 @@ def _retraction(scene: Scene, bench: Bench) -> list[str]:
     protocol = scene.protocol
     if not isinstance(protocol, ContactSection):
         return []
-    most = room_um(bench, bench.limits.tension_N) / (bench.daq.frame_s + REACTION_S)
+    most = room_um(bench, bench.limits.tension_N) / reaction_s(bench)
     remedies = {"lower tension_N or shorten frame_ms": most}
     return _too_fast("retract_speed_um_s", protocol.retract_speed_um_s, bench, remedies)
 
@@ -260,6 +260,11 @@ def _stiffness(bench: Bench) -> str:
     return f"its force changes by {words}" if known else f"its compliance is unknown, {words} is assumed"
 
 
+def reaction_s(bench: Bench) -> float:
+    """Return the longest time from a sample that passes a limit to the stop byte, s: its frame and the reaction."""
+    return bench.daq.frame_s + REACTION_S
+
+
 def room_um(bench: Bench, force: float) -> float:
     """Return how far the stage may go on from this force (N) against something rigid, um."""
     compliance = bench.force.compliance_um_per_N or STIFFEST_UM_PER_N
@@ -272,6 +277,6 @@ def parking(bench: Bench) -> Parking:
     start = bench.stage.start_mm
     return Parking(
         start=None if start is None else start * 1e-3,
-        speed=min(PARK_SPEED, room_um(bench, touch) * 1e-6 / (bench.daq.frame_s + REACTION_S)),
+        speed=min(PARK_SPEED, room_um(bench, touch) * 1e-6 / reaction_s(bench)),
         touch=touch,
     )

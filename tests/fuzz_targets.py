@@ -10,7 +10,7 @@ import struct
 import tempfile
 import tomllib
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -97,45 +97,44 @@ def one_message(error: Exception) -> None:
     assert all(character.isprintable() for character in text), repr(text)
 
 
-def scene_file(data: bytes) -> None:
+@contextlib.contextmanager
+def refusing(*kinds: type[Exception]) -> Iterator[None]:
+    """Let through errors of these kinds that are one clear message."""
     try:
-        check(parse_scene(data.decode(errors="replace"), "scene.toml"), parse_bench(BENCH, "bench.toml"))
-    except (FileError, Refused) as error:
+        yield
+    except kinds as error:
         one_message(error)
+
+
+def scene_file(data: bytes) -> None:
+    with refusing(FileError, Refused):
+        check(parse_scene(data.decode(errors="replace"), "scene.toml"), parse_bench(BENCH, "bench.toml"))
 
 
 def bench_file(data: bytes) -> None:
-    try:
+    with refusing(FileError, Refused):
         check(parse_scene(SCENE, "scene.toml"), parse_bench(data.decode(errors="replace"), "bench.toml"))
-    except (FileError, Refused) as error:
-        one_message(error)
 
 
 def fault_file(data: bytes) -> None:
     path = _scratch() / "faults.toml"
     path.write_bytes(data)
-    try:
+    with refusing(FileError):
         load_faults(path)
-    except FileError as error:
-        one_message(error)
 
 
 def campaign_file(data: bytes) -> None:
     path = _scratch() / "campaign.toml"
     path.write_bytes(data)
-    try:
+    with refusing(FileError):
         load_campaign(path)
-    except FileError as error:
-        one_message(error)
 
 
 def campaign_journal(data: bytes) -> None:
     (_scratch() / JOURNAL).write_bytes(data)
     journal = Journal(_scratch())
-    try:
+    with refusing(FileError):
         assert all(Path(name).name == name for name in journal.done().values())
-    except FileError as error:
-        one_message(error)
 
 
 def gcs_replies(data: bytes) -> None:
@@ -369,10 +368,8 @@ def recording_bytes(data: bytes) -> None:
         content[int.from_bytes(choices.take(4), "little") % len(content)] ^= 1 << choices.below(8)
     path = _scratch() / "changed.h5"
     path.write_bytes(content[: len(content) - choices.below(2) * choices.below(len(content))])
-    try:
+    with refusing(FileError):
         load_recording(path)
-    except FileError as error:
-        one_message(error)
 
 
 def journal(data: bytes) -> None:
@@ -396,11 +393,9 @@ def journal(data: bytes) -> None:
     path.write_bytes(b"")
     prefixed = (struct.pack("<QI", len(record), zlib.crc32(record)) + record for record in records)
     journal_of(path).write_bytes(_MAGIC + b"".join(prefixed)[: -choices.below(20) or None])
-    try:
-        with mock.patch("rig.recovery.probe"):  # without a journal that can be read, the empty file itself is tried
-            recover(path)
-    except FileError as error:
-        one_message(error)
+    # Without a journal that can be read, the empty file itself is tried.
+    with refusing(FileError), mock.patch("rig.recovery.probe"):
+        recover(path)
 
 
 TARGETS: dict[str, tuple[Callable[[bytes], None], tuple[bytes, ...]]] = {
