@@ -110,7 +110,8 @@ class LinkServer(Observer):
         self._lock = threading.Lock()
         self._connections: set[Connection] = set()
         self._commander: str | None = None
-        self._behind: dict[str, bool] = {}
+        self._cursors: dict[str, int] = {}
+        """How far in the log each console has got; changed under the log's condition."""
         self.dropped = 0
         """Frames dropped because the link's own thread did not keep up."""
         address_file(self._name)  # refuses before anything is open
@@ -169,7 +170,7 @@ class LinkServer(Observer):
         deadline = time.monotonic() + drain_s
         with self._log.changed:
             self._log.changed.notify_all()
-            while any(self._behind.values()) and (left := deadline - time.monotonic()) > 0:
+            while self._somebody_is_behind() and (left := deadline - time.monotonic()) > 0:
                 self._log.changed.wait(min(left, 0.05))
         self._path.unlink(missing_ok=True)
         self._wake_acceptor()
@@ -177,6 +178,9 @@ class LinkServer(Observer):
         with self._lock:
             for connection in self._connections:
                 hang_up(connection)
+
+    def _somebody_is_behind(self) -> bool:
+        return any(cursor < self._log.end for cursor in self._cursors.values())
 
     def _wake_acceptor(self) -> None:
         with contextlib.suppress(OSError):
@@ -253,12 +257,10 @@ class LinkServer(Observer):
             admit(connection, self.address.key)
             hello = json.loads(receive_text(connection))
             role, who = str(hello["role"]), str(hello["who"])
-            if role == "emergency":  # the last of a console's connections
-                self._attached.set()
             if role == "watch":
                 self._show(connection, who)
             else:
-                self._listen(connection, who)
+                self._listen(connection, who, last=role == "emergency")
         except (LinkError, EOFError, OSError, ValueError, KeyError, TypeError):
             pass  # a peer that left or was never one of ours: the run goes on without it
         finally:
@@ -267,9 +269,8 @@ class LinkServer(Observer):
             connection.close()
 
     def _show(self, connection: Connection, who: str) -> None:
-        cursor = self._log.begin
         log = self._log
-        self._behind[who] = True
+        cursor = self._note(who, log.begin)
         try:
             connection.send_bytes(READY)
             while True:
@@ -278,20 +279,28 @@ class LinkServer(Observer):
                     connection.send_bytes(encode(Gap(missed)))
                 if data is not None:
                     connection.send_bytes(data)
-                    continue
+                self._note(who, cursor)
                 with log.changed:
                     if cursor >= log.end:
-                        self._behind[who] = False
-                        log.changed.notify_all()
                         if self._closing.is_set() and not self._packer.is_alive():
                             return
                         log.changed.wait(0.5)
-                        self._behind[who] = True
         finally:
-            self._behind.pop(who, None)
+            with log.changed:
+                self._cursors.pop(who, None)
 
-    def _listen(self, connection: Connection, who: str) -> None:
+    def _note(self, who: str, cursor: int) -> int:
+        with self._log.changed:
+            self._cursors[who] = cursor
+            if cursor >= self._log.end:
+                self._log.changed.notify_all()
+        return cursor
+
+    def _listen(self, connection: Connection, who: str, *, last: bool) -> None:
+        """Take commands; ``last`` says that this is the last of the console's connections to be made."""
         connection.send_bytes(READY)
+        if last:
+            self._attached.set()
         try:
             while True:
                 command = receive_text(connection)

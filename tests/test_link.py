@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Client
 from pathlib import Path
 from typing import Any
@@ -254,17 +255,21 @@ def test_a_damaged_address_file_is_named(runtime: Path) -> None:
         addresses.running()
 
 
-@pytest.mark.parametrize("slow_s", [0.0, 0.5])
+@pytest.mark.parametrize("slow", ["nothing", "the greeting", "_show", "_listen"])
 def test_a_run_that_is_over_at_once_waits_for_the_console_that_started_it(
-    slow_s: float, monkeypatch: pytest.MonkeyPatch
+    slow: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    delays = [slow_s]  # of the thread that is to show the run
+    def slowly(work: Callable[..., Any]) -> Callable[..., Any]:
+        def late(*arguments: Any, **more: Any) -> Any:
+            time.sleep(0.3)
+            return work(*arguments, **more)
 
-    def hear(connection: Any) -> str:
-        time.sleep(delays.pop() if delays else 0.0)
-        return receive_text(connection)
+        return late
 
-    monkeypatch.setattr(link_server, "receive_text", hear)
+    if slow == "the greeting":
+        monkeypatch.setattr(link_server, "receive_text", slowly(receive_text))
+    elif slow != "nothing":
+        monkeypatch.setattr(LinkServer, slow, slowly(getattr(LinkServer, slow)))
     monkeypatch.setenv(link_server.NAME_VARIABLE, "console-1")
     server = LinkServer(Controls())
     server.started(run_info())
@@ -278,6 +283,29 @@ def test_a_run_that_is_over_at_once_waits_for_the_console_that_started_it(
     assert take_until(link, Ending)
     closing.join()
     assert addresses.running() == []
+    link.close()
+
+
+def test_a_console_that_has_yet_to_wake_up_gets_the_last_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Drowsy(threading.Condition):
+        def wait(self, timeout: float | None = None) -> bool:
+            woken = super().wait(timeout)
+            if threading.current_thread().name == "link serve":
+                self.release()
+                time.sleep(0.05)
+                self.acquire()
+            return woken
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading, "Condition", Drowsy)
+        server = LinkServer(Controls())
+    link = Link(server.address)
+    server.started(run_info())
+    take_until(link, RunInfo)
+    time.sleep(0.2)  # the console has everything and sleeps
+    server.finished(Ending("done", 0, 0))
+    server.close()
+    assert take_until(link, Ending)
     link.close()
 
 
