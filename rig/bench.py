@@ -6,11 +6,11 @@ from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from rig.library import find
-from rig.scene import Section, Title
-from rig.validation import parsed
+from rig.scene import Title
+from rig.validation import Section, parsed, rule
 
 EMULATED = "emulated"
 """Connection of an instrument that the program emulates itself."""
@@ -37,7 +37,7 @@ class StageSection(Section):
     left_on: bool = False
     reply_timeout_ms: Annotated[float, Field(ge=20, le=5000)] = 400.0
 
-    @model_validator(mode="after")
+    @rule
     def _has_travel(self) -> StageSection:
         if self.minimum_mm >= self.maximum_mm:
             raise ValueError(f"minimum_mm = {self.minimum_mm:g} must lie below maximum_mm = {self.maximum_mm:g}")
@@ -48,7 +48,7 @@ class StageSection(Section):
             )
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _was_left_on_somewhere(self) -> StageSection:
         if self.left_on and (self.connection != EMULATED or self.start_mm is None):
             raise ValueError("left_on is for an emulated stage that has a start_mm; a real stage is asked")
@@ -159,7 +159,7 @@ class PressureSection(Section):
     zero: ZeroSection | None = None
     calibration: PressureCalibrationSection | None = None
 
-    @model_validator(mode="after")
+    @rule
     def _has_one_zero(self) -> PressureSection:
         if self.zero is not None and self.calibration is not None and self.calibration.intercept:
             raise ValueError(
@@ -198,7 +198,7 @@ class Bench(Section):
     pressure: PressureSection | None = None
     recording: RecordingSection = RecordingSection()
 
-    @model_validator(mode="after")
+    @rule
     def _cell_is_protected(self) -> Bench:
         most = OVERLOAD * self.force.capacity_N
         for key in ("compression_N", "tension_N"):
@@ -210,7 +210,7 @@ class Bench(Section):
                 )
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _is_emulated_as_a_whole(self) -> Bench:
         parts = {"stage": self.stage, "daq": self.daq, "pump": self.pump}
         emulated = {name: part.connection == EMULATED for name, part in parts.items() if part is not None}
@@ -222,7 +222,7 @@ class Bench(Section):
             )
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _is_filled_in(self) -> Bench:
         texts = {
             "stage.connection": self.stage.connection,
@@ -252,12 +252,12 @@ def load_bench(path: Path | None) -> tuple[Bench, str]:
     return parse_bench(text, source), text
 
 
-def parse_bench(text: str, source: str) -> Bench:
-    """Check the text of a bench file; ``source`` names it in messages.
+def parse_bench(text: str, source: str, *, recorded: bool = False) -> Bench:
+    """Check the text of a bench file; ``source`` names it in messages, ``recorded`` leaves out what is for a new run.
 
     Raises
     ------
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    return parsed(Bench, "bench", text, source)
+    return parsed(Bench, "bench", text, source, recorded=recorded)

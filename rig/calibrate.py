@@ -16,7 +16,8 @@ import numpy as np
 from rig.errors import FileError
 from rig.measured import began
 from rig.recording import Recording
-from rig.scene import ComplianceSection, DeadWeightsSection, Section
+from rig.scene import ComplianceSection, DeadWeightsSection
+from rig.validation import Section
 from sequences.calibration import WEIGH, weighing_order
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from pydantic import Field
 
 from rig.errors import FileError
 from rig.library import find, load_scene
-from rig.scene import PRINTABLE, Scene, Section, Title, parse_scene
-from rig.validation import parsed
+from rig.scene import PRINTABLE, Scene, Title, parse_scene
+from rig.validation import Section, parsed
 
 JOURNAL = "journal.jsonl"
 MOST_REPEATS = 1000

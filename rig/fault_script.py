@@ -9,8 +9,7 @@ from pydantic import Field, model_validator
 
 from drivers.emulated.faults import Fault, Faults
 from rig.library import read_text
-from rig.scene import Section
-from rig.validation import parsed
+from rig.validation import Section, parsed
 
 Samples = Annotated[int, Field(ge=0)]
 

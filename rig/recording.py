@@ -102,7 +102,7 @@ def protocol_of(path: Path) -> str:
             text = entry["configuration/scene"].asstr()[()]
         except (KeyError, OSError, RuntimeError, UnicodeDecodeError) as error:
             raise FileError(f"recording {path}: damaged ({error}). Remedy: try `rig recover` on a copy.") from error
-    return parse_scene(text, f"{path}:scene").protocol.name
+    return parse_scene(text, f"{path}:scene", recorded=True).protocol.name
 
 
 def read_through(path: Path) -> None:
@@ -154,8 +154,8 @@ def _read(entry: h5py.Group, path: Path) -> Recording:
     ending = entry["ending"][:]
     return Recording(
         path=path,
-        scene=parse_scene(configuration["scene"], f"{path}:scene"),
-        bench=parse_bench(configuration["bench"], f"{path}:bench"),
+        scene=parse_scene(configuration["scene"], f"{path}:scene", recorded=True),
+        bench=parse_bench(configuration["bench"], f"{path}:bench", recorded=True),
         configuration=configuration,
         info=json.loads(configuration["run"]),
         rate=float(entry["raw"].attrs["sample_rate_Hz"]),

@@ -19,8 +19,8 @@ from rig.protocols import apparatus_of, build_steps
 from rig.recording import Recording
 from rig.replay import EndOfRecording, Pace, ReplayedControls, ReplayedDaq, ReplayedPump, ReplayedStage, Verification
 from rig.safe_state import make_safe
-from rig.scene import Scene, Section
-from rig.validation import validated
+from rig.scene import Scene
+from rig.validation import Section, validated
 from sequences.errors import StepFailed
 from sequences.step import play
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from model.parameters import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate
-from rig.validation import parsed
+from rig.validation import Section, parsed, rule
 
 PRINTABLE = r"^[^\x00-\x1f\x7f-\x9f]*$"
 """Control characters would act on the terminal that shows the text."""
@@ -22,19 +22,13 @@ FINEST_ML = 1e-5
 """The smallest stroke that is worth moving; the pump itself takes a tenth of it."""
 
 
-class Section(BaseModel):
-    """A table of a scene or bench file: unknown keys and wrong types are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
 class SubstrateSection(Section):
     """``[substrate]``."""
 
     shape: Literal["sphere", "flat"]
     diameter_mm: Annotated[float, Field(ge=0.1, le=1e7)] | None = None
 
-    @model_validator(mode="after")
+    @rule
     def _sphere_has_a_diameter(self) -> SubstrateSection:
         if self.shape == "sphere" and self.diameter_mm is None:
             raise ValueError("a sphere needs diameter_mm")
@@ -50,7 +44,7 @@ class GripperSection(Section):
     effective_radius_uncertainty_mm: Annotated[float, Field(ge=0, le=1e3)] = 0.1
     chamber_volume_ml: Annotated[float, Field(gt=0, le=1e9)] = 7.2
 
-    @model_validator(mode="after")
+    @rule
     def _contact_fits_the_rim(self) -> GripperSection:
         if self.effective_radius_mm > self.radius_mm:
             raise ValueError(
@@ -152,7 +146,7 @@ class VolumeSection(Section):
     strokes_ml: Annotated[tuple[float, ...], Field(min_length=2, strict=False)] = (-0.1, -0.1, 0.2, 0.1, -0.1)
     settle_s: Annotated[float, Field(ge=0.5, le=3600)] = 3.0
 
-    @model_validator(mode="after")
+    @rule
     def _every_stroke_moves(self) -> VolumeSection:
         if any(abs(stroke) < FINEST_ML for stroke in self.strokes_ml):
             raise ValueError(
@@ -204,17 +198,22 @@ class PressureZeroSection(Section):
     rest_s: Annotated[float, Field(ge=0.5, le=600)] = 2.0
 
 
+def name_of(table: Any) -> Any:
+    """Return which protocol a table is of."""
+    return table.get("name") if isinstance(table, dict) else getattr(table, "name", None)
+
+
 ProtocolSection = Annotated[
-    PullOffSection
-    | IndentationSection
-    | FiberSection
-    | PunchSection
-    | VolumeSection
-    | LeakSection
-    | ComplianceSection
-    | DeadWeightsSection
-    | PressureZeroSection,
-    Field(discriminator="name"),
+    Annotated[PullOffSection, Tag("pull_off")]
+    | Annotated[IndentationSection, Tag("indentation")]
+    | Annotated[FiberSection, Tag("fiber")]
+    | Annotated[PunchSection, Tag("punch")]
+    | Annotated[VolumeSection, Tag("volume")]
+    | Annotated[LeakSection, Tag("leak")]
+    | Annotated[ComplianceSection, Tag("compliance")]
+    | Annotated[DeadWeightsSection, Tag("dead_weights")]
+    | Annotated[PressureZeroSection, Tag("pressure_zero")],
+    Discriminator(name_of),
 ]
 
 WITH_CHAMBER = frozenset({"volume", "leak", "pressure_zero"})
@@ -273,12 +272,12 @@ class Scene(Section):
         )
 
 
-def parse_scene(text: str, source: str) -> Scene:
-    """Check the text of a scene file; ``source`` names it in messages.
+def parse_scene(text: str, source: str, *, recorded: bool = False) -> Scene:
+    """Check the text of a scene file; ``source`` names it in messages, ``recorded`` leaves out what is for a new run.
 
     Raises
     ------
     FileError
         Names the file, the key, the value and the allowed range.
     """
-    return parsed(Scene, "scene", text, source)
+    return parsed(Scene, "scene", text, source, recorded=recorded)

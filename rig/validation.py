@@ -4,23 +4,84 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
 
 from rig.errors import FileError
 
 Schema = TypeVar("Schema", bound=BaseModel)
 
+BOUNDS = frozenset(
+    {
+        "greater_than",
+        "greater_than_equal",
+        "less_than",
+        "less_than_equal",
+        "string_pattern_mismatch",
+        "string_too_long",
+        "too_short",
+    }
+)
+"""Findings that say what may be run, and nothing against reading what has been."""
 
-def parsed(schema: type[Schema], kind: str, text: str, source: str) -> Schema:
+
+class Section(BaseModel):
+    """A table of a file: unknown keys and wrong types are refused.
+
+    What a recording was made with is read whatever bounds and rules have become since; its structure is checked.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _within_bounds(cls, value: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        try:
+            return check(value)
+        except ValidationError as error:
+            if _recorded(info) and all(finding["type"] in BOUNDS for finding in error.errors()):
+                return _as_it_stands(value)
+            raise
+
+
+def rule(check: Callable[[Schema], Schema]) -> Any:
+    """Make a method of a ``Section``, which may raise ``ValueError``, a rule for its values; none for recorded ones."""
+
+    def checked(section: Schema, info: ValidationInfo) -> Schema:
+        return section if _recorded(info) else check(section)
+
+    return model_validator(mode="after")(checked)
+
+
+def _recorded(info: ValidationInfo) -> bool:
+    return bool(info.context)
+
+
+def _as_it_stands(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(map(_as_it_stands, value))
+    return _printable(value) if isinstance(value, str) else value
+
+
+def parsed(schema: type[Schema], kind: str, text: str, source: str, *, recorded: bool = False) -> Schema:
     """Check the text of a TOML file.
 
     Parameters
     ----------
     kind, source
         What the file is, and where: the beginning of every message.
+    recorded
+        The text is that of a recording: bounds and rules, which are for a run to come, are left out.
 
     Raises
     ------
@@ -31,10 +92,12 @@ def parsed(schema: type[Schema], kind: str, text: str, source: str) -> Schema:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{kind} {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
-    return validated(schema, kind, content, source)
+    return validated(schema, kind, content, source, recorded=recorded)
 
 
-def validated(schema: type[Schema], kind: str, content: dict[str, Any], source: str) -> Schema:
+def validated(
+    schema: type[Schema], kind: str, content: dict[str, Any], source: str, *, recorded: bool = False
+) -> Schema:
     """Check the content of a file, as ``parsed`` its text.
 
     Raises
@@ -43,7 +106,7 @@ def validated(schema: type[Schema], kind: str, content: dict[str, Any], source: 
         Names key, value, reason and remedy of every finding.
     """
     try:
-        return schema.model_validate(content)
+        return schema.model_validate(content, context={"recorded": True} if recorded else None)
     except ValidationError as error:
         lines = [_line(finding, schema, content) for finding in error.errors(include_url=False)]
         raise FileError(_printable(f"{kind} {source}: " + "; ".join(dict.fromkeys(lines)))) from error

@@ -266,3 +266,50 @@ def test_figures_say_what_they_do_not_show(made: Path, tmp_path: Path, capsys: p
 def test_what_could_not_be_analysed_sets_the_exit_code() -> None:
     assert Collection().exit_code == 0
     assert Collection(left={"a": "b"}).exit_code == 2
+
+
+def rewrite(path: Path, part: str, *changes: tuple[str, str]) -> None:
+    """Change the text of a scene or bench within a recording."""
+    with h5py.File(path, "r+") as file:
+        whole = file[f"entry/configuration/{part}"]
+        text = whole.asstr()[()]
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        whole[()] = text
+
+
+def test_what_was_recorded_stays_readable_when_bounds_and_rules_become_narrower(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = shutil.copy(made / "first.h5", tmp_path / "first.h5")
+    rewrite(
+        old, "bench", ("compression_N = 4.4", "compression_N = 44.0"), ("look_ahead_um = 50.0", "look_ahead_um = 5e6")
+    )
+    rewrite(old, "bench", ('title = "emulated bench"', f'title = "{"long " * 50}\\u001b[2J"'))
+    rewrite(old, "scene", ("radius_mm = 8.0", "radius_mm = 1.0"), ("thickness_um = 200.0", "thickness_um = 1e6"))
+    code, out, err = analyze(capsys, old, "--json")
+    assert code == 0, err
+    found, before = json.loads(out), json.loads(analyze(capsys, made / "first.h5", "--json")[1])
+    assert found["pull_off_force_N"] == before["pull_off_force_N"]
+    assert found["bench"].endswith("long \\x1b[2J")
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "words"),
+    [
+        ("bench", ("compression_N = 4.4", 'compression_N = "4.4"'), "limits.compression_N = '4.4'"),
+        ("bench", ("compression_N = 4.4", "compression_N = nan"), "limits.compression_N = nan"),
+        ("bench", ("tension_N = 4.4", ""), "limits.tension_N is missing"),
+        ("scene", ('shape = "sphere"', 'shape = "cube"'), "substrate.shape = 'cube'"),
+    ],
+)
+def test_a_recorded_text_of_wrong_structure_names_recording_and_key(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], part: str, change: tuple[str, str], words: str
+) -> None:
+    spoilt = shutil.copy(made / "first.h5", tmp_path / "first.h5")
+    rewrite(spoilt, part, change)
+    code, _, err = analyze(capsys, spoilt)
+    assert code == 2
+    assert f"{spoilt}:{part}: {words}" in err
+    assert "Traceback" not in err
