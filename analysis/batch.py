@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from analysis.errors import NoScheduler
+from analysis.errors import NoScheduler, WorkerLost
 from analysis.pipeline import Analysis, analyze, lighten
 from analysis.run import Run
 from model.errors import ModelError
 from model.prediction import Prediction
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future, ProcessPoolExecutor
+
     from distributed import Client
 
 Item = TypeVar("Item")
@@ -22,6 +24,11 @@ Outcome = TypeVar("Outcome")
 
 ANSWER_SECONDS = 10
 """How long a scheduler may take to answer."""
+
+ATTEMPTS = 2
+"""How often an item is tried alone after a process was killed that may have been at work on it."""
+
+LOST = "every process at work on it was killed. Remedy: look for what kills them; memory may run out."
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +122,11 @@ def on_all_cores(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    lost: Callable[[Item, str], Outcome] | None = None,
 ) -> Iterator[Outcome]:
     """Apply ``function`` to each item, in order: here, on several processes, or on a Dask cluster.
+
+    What a process was at when it was killed from outside (memory may have run out) is computed again.
 
     Parameters
     ----------
@@ -126,27 +136,100 @@ def on_all_cores(
         Number of processes; ``None``: one per core, 1: none but this one.
     scheduler
         Address of a Dask scheduler; overrides ``workers``.
+    lost
+        Makes an outcome of an item and the reason why it has none: every process that tried it was killed.
 
     Raises
     ------
     NoScheduler
         None answers there.
+    WorkerLost
+        An item is lost, and ``lost`` not given; or the scheduler is.
     """
     import os
 
-    if scheduler is not None:
-        with connected(scheduler) as client:
-            yield from (future.result() for future in client.map(function, items, pure=False))
-        return
+    lost = lost or _refuse
     count = min(workers or os.cpu_count() or 1, len(items))
-    if count <= 1:
+    if scheduler is not None:
+        yield from _on_cluster(function, items, scheduler, lost)
+    elif count > 1:
+        yield from _on_processes(function, items, count, lost)
+    else:
         yield from map(function, items)
-        return
+
+
+def _refuse(item: object, reason: str) -> Any:
+    raise WorkerLost(f"{item}: {reason}")
+
+
+def _on_processes(
+    function: Callable[[Item], Outcome], items: Sequence[Item], count: int, lost: Callable[[Item, str], Outcome]
+) -> Iterator[Outcome]:
+    """Work on processes; of a broken pool those items that may have been at work are computed again, each alone."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    left = list(items)
+    while left:
+        with _processes(min(count, len(left))) as pool:
+            futures: list[Future[Outcome]] = []
+            with suppress(BrokenProcessPool):
+                for item in left:
+                    futures.append(pool.submit(function, item))
+            suspects = count + 1  # one item waits in the pool's queue
+            for future in futures:
+                try:
+                    outcome = future.result()
+                except BrokenProcessPool:
+                    if not suspects:
+                        break
+                    suspects -= 1
+                    outcome = _alone(function, left[0], lost)
+                left.pop(0)
+                yield outcome
+
+
+def _alone(function: Callable[[Item], Outcome], item: Item, lost: Callable[[Item, str], Outcome]) -> Outcome:
+    from concurrent.futures.process import BrokenProcessPool
+
+    for _ in range(ATTEMPTS):
+        with suppress(BrokenProcessPool), _processes(1) as pool:
+            return pool.submit(function, item).result()
+    return lost(item, LOST)
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Give processes that do not begin on what nobody waits for any more; spawned, as on Windows."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
     with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(function, items)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _on_cluster(
+    function: Callable[[Item], Outcome], items: Sequence[Item], scheduler: str, lost: Callable[[Item, str], Outcome]
+) -> Iterator[Outcome]:
+    """Work on a cluster; its scheduler computes again what a lost worker was at, but gives up what was beside a killer."""
+    with connected(scheduler) as client:
+        from concurrent.futures import CancelledError
+
+        from distributed import KilledWorker
+
+        def outcome_of(item: Item, future: Any) -> Outcome:
+            with suppress(KilledWorker):
+                return cast("Outcome", future.result())
+            with suppress(KilledWorker):
+                return cast("Outcome", client.submit(function, item, pure=False).result())
+            return lost(item, LOST)
+
+        try:
+            yield from map(outcome_of, items, client.map(function, items, pure=False))
+        except CancelledError as error:
+            raise WorkerLost(f"scheduler {scheduler}: is gone. Remedy: start it again, and this command.") from error
 
 
 @contextmanager

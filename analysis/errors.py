@@ -11,6 +11,10 @@ class NoScheduler(AnalysisError):
     exit_code = 2
 
 
+class WorkerLost(AnalysisError):
+    """Every process at work on an item was killed from outside; or the cluster is gone."""
+
+
 class UnknownFormat(AnalysisError):
     """A picture is asked for in a format that is not written."""
 

@@ -7,9 +7,11 @@ depend on who does it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from analysis.batch import on_all_cores
 from model import MODELS, InvalidParameter, ModelError, Parameters
 
 if TYPE_CHECKING:
@@ -66,38 +68,12 @@ def sweep(
         raise InvalidParameter(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
     size = BLOCK[model in VECTORISED]
     blocks = [list(scenes[first : first + size]) for first in range(0, len(scenes), size)]
-    finished: Iterable[list[Row]] = _map(model, blocks, processes, scheduler)
+    finished: Iterable[list[Row]] = on_all_cores(
+        partial(solve_block, model), blocks, workers=processes, scheduler=scheduler, lost=_lost_block
+    )
     if progress is not None:
         finished = progress(finished, len(blocks))
     return pd.DataFrame([row for block in finished for row in block])
-
-
-def _map(model: str, blocks: list[list[Parameters]], processes: int, scheduler: str | None) -> Iterator[list[Row]]:
-    if scheduler is not None:
-        yield from _on_cluster(model, blocks, scheduler)
-    elif processes > 1 and len(blocks) > 1:
-        yield from _on_processes(model, blocks, processes)
-    else:
-        for block in blocks:
-            yield solve_block(model, block)
-
-
-def _on_processes(model: str, blocks: list[list[Parameters]], processes: int) -> Iterator[list[Row]]:
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    # Spawned, as on Windows: a forked child would inherit the locks of the parent's threads.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(blocks)), mp_context=context) as pool:
-        yield from pool.map(solve_block, [model] * len(blocks), blocks)
-
-
-def _on_cluster(model: str, blocks: list[list[Parameters]], scheduler: str) -> Iterator[list[Row]]:
-    from analysis.batch import connected
-
-    with connected(scheduler) as client:
-        for future in client.map(solve_block, [model] * len(blocks), blocks, pure=False):
-            yield future.result()
 
 
 def solve_block(model: str, scenes: list[Parameters]) -> list[Row]:
@@ -115,15 +91,24 @@ def solve_block(model: str, scenes: list[Parameters]) -> list[Row]:
 
 def _solve_alone(model: str, scene: Parameters) -> Row:
     from model import predict
-    from model.batch import ERRORS, FEATURES
+    from model.batch import FEATURES
 
-    units = {name: "N" if name.endswith("force") else "m" for name in FEATURES}
     try:
         prediction = predict(scene, model, points=64)
     except ModelError as error:
-        row: Row = {"outcome": f"{type(error).__name__}: {error}"}
-        row |= {f"{name}_{unit}": math.nan for name, unit in units.items()}
-        return row | {f"{name}_error_{units[name]}": math.nan for name in ERRORS}
-    row = {"outcome": prediction.outcome.value}
-    row |= {f"{name}_{unit}": getattr(prediction, name) for name, unit in units.items()}
-    return row | {f"{name}_error_{units[name]}": prediction.numerical_error.get(name, math.nan) for name in ERRORS}
+        return _row(f"{type(error).__name__}: {error}", {}, {})
+    values = {name: getattr(prediction, name) for name in FEATURES}
+    return _row(prediction.outcome.value, values, prediction.numerical_error)
+
+
+def _lost_block(scenes: list[Parameters], reason: str) -> list[Row]:
+    return [_row(reason, {}, {}) for _ in scenes]
+
+
+def _row(outcome: str, values: Mapping[str, float], errors: Mapping[str, float]) -> Row:
+    from model.batch import ERRORS, FEATURES
+
+    units = {name: "N" if name.endswith("force") else "m" for name in FEATURES}
+    row: Row = {"outcome": outcome}
+    row |= {f"{name}_{unit}": values.get(name, math.nan) for name, unit in units.items()}
+    return row | {f"{name}_error_{units[name]}": errors.get(name, math.nan) for name in ERRORS}

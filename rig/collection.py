@@ -107,7 +107,11 @@ def collect(
     items = list(zip(found.files, own_names(found.files), strict=True))
     workers = 1 if jobs is None and len(items) <= 3 else jobs
     outcomes = on_all_cores(
-        partial(analyze_file, model=model, pictures=pictures, areas=areas), items, workers=workers, scheduler=scheduler
+        partial(analyze_file, model=model, pictures=pictures, areas=areas),
+        items,
+        workers=workers,
+        scheduler=scheduler,
+        lost=lambda _, reason: reason,
     )
     quiet = len(items) < 2 or not sys.stderr.isatty()
     seen: dict[str, str] = {}

@@ -90,7 +90,10 @@ def _run_all(
             yield _enter(journal, test, *_run_one(test, bench, bench_text, out, arguments.direct, keyboard))
         return
     from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures.process import BrokenProcessPool
     from multiprocessing import get_context
+
+    from rig.errors import RigError
 
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         futures = {
@@ -98,7 +101,14 @@ def _run_all(
             for test in tests
         }
         for future in as_completed(futures):
-            yield _enter(journal, futures[future], *future.result())
+            try:
+                outcome = future.result()
+            except BrokenProcessPool as error:
+                raise RigError(
+                    "campaign: a process was killed, and with it the tests under way. Remedy: the same command goes on "
+                    "where it stopped; with fewer --jobs if memory has run out."
+                ) from error
+            yield _enter(journal, futures[future], *outcome)
 
 
 def _run_one(
