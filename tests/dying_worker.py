@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def square(folder: Path, deaths: Mapping[int, int], number: int) -> int:
-    """Return the square of ``number`` after as many deaths as it is to have; ``folder`` counts them, and the squares."""
+    """Return the square of ``number`` after as many deaths as it is to have; ``folder`` counts them."""
     died = len(list(folder.glob(f"{number}-death-*")))
     if died < deaths.get(number, 0):
         (folder / f"{number}-death-{died}").touch()
