@@ -213,7 +213,7 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
 def _on_cluster(
     function: Callable[[Item], Outcome], items: Sequence[Item], scheduler: str, lost: Callable[[Item, str], Outcome]
 ) -> Iterator[Outcome]:
-    """Work on a cluster. Its scheduler computes again what a lost worker was at, but may give up a killer's neighbours."""
+    """Work on a cluster. Its scheduler repeats what a lost worker was at, but may give up a killer's neighbours."""
     with connected(scheduler) as client:
         from concurrent.futures import CancelledError
 
