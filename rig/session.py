@@ -9,7 +9,7 @@ import signal
 import threading
 import traceback
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +30,7 @@ from rig.recorder import Recorder, insist_on_new
 from rig.recovery import recover
 from rig.safe_state import make_safe, release
 from rig.scene import Scene
+from rig.undisturbed import undisturbed
 from rig.voice import say
 from sequences.errors import StepFailed
 from sequences.reference import reference
@@ -153,7 +154,10 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     loop = _loop(request, opened, Instruments(stage, pump, opened.daq, opened.clock), reporter, recorder)
     try:
         reporter.notify("started", info)
-        ending = _play(loop, steps, reporter)
+        with nullcontext("") if opened.virtual else undisturbed() as precedence:
+            if precedence:
+                reporter.event("timing", precedence)
+            ending = _play(loop, steps, reporter)
     finally:
         failures = make_safe(stage, pump, opened.daq)
         reporter.event("timing", _timing(loop, virtual=opened.virtual))

@@ -21,6 +21,7 @@ def test_every_trip_sends_one_stop_byte_to_the_controller(tmp_path):
     assert tripped  # a computer that is too busy for real time ends a run for that
     assert len(latencies) == len(tripped)
     assert (latencies > 0).all()
+    assert any(b"precedence over other programs" in row["text"] for row in load_recording(tmp_path / "0.h5").events)
 
 
 def test_a_recording_tells_how_long_the_interlocks_took(request_for):
