@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from rig.bench import load_bench
 from rig.library import find
+from rig.link_address import DIRECTORY_VARIABLE
 from rig.scene import Scene
 from rig.session import Request
 
-settings.register_profile("same", derandomize=True)
-settings.register_profile("explore", derandomize=False, print_blob=True)
+# How long an input takes is the computer's affair.
+ANY_SPEED: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("same", derandomize=True, **ANY_SPEED)
+settings.register_profile("explore", derandomize=False, print_blob=True, **ANY_SPEED)
 settings.load_profile("same")
 
 SHORT = {"preload_dwell_s": 1.0, "tare_s": 0.5, "retract_speed_um_s": 100.0, "preload_N": 0.3}
@@ -31,6 +34,14 @@ def scene_text(name: str, **protocol: Any) -> str:
         lines = [line for line in lines if not line.startswith(f"{key} ")]
         lines.append(f"{key} = {value}")
     return "\n".join(lines)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep locks and addresses of the tests' runs, and of the processes they start, apart from all others."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(DIRECTORY_VARIABLE, str(tmp_path_factory.mktemp("runs")))
+        yield
 
 
 @pytest.fixture

@@ -14,13 +14,13 @@ Exchange = tuple[bytes, bytes]
 def dialogue(exchanges: Sequence[Exchange]) -> Iterator[str]:
     """Serve one dialogue on TCP and yield its address; fail unless exactly these bytes came, and in this order."""
     listener = socket.create_server(("127.0.0.1", 0))
-    listener.settimeout(5)
+    listener.settimeout(60)
     heard: list[bytes] = []
 
     def converse() -> None:
         connection, _ = listener.accept()
         with connection:
-            connection.settimeout(5)
+            connection.settimeout(60)
             for expected, reply in exchanges:
                 heard.append(receive(connection, len(expected)))
                 if heard[-1] != expected:

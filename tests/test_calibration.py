@@ -9,7 +9,7 @@ from datetime import date
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.calibration import Calibration, InvalidCalibration
@@ -66,7 +66,6 @@ values = st.one_of(
 )
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow])  # the first strings of a process take seconds
 @given(st.dictionaries(st.sampled_from(FIELDS), values))
 def test_no_values_make_anything_but_a_record_or_one_clear_error(changes: dict[str, Any]) -> None:
     try:

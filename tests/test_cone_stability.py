@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analysis.accuracy.extremes import closed_at_start
@@ -15,8 +15,8 @@ from analysis.accuracy.stability_study import is_sound
 from model import Gas, GasAnchor, Gripper, Membrane, Parameters, Substrate, cone
 from model.prediction import Outcome
 
-MANY = settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-SOME = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+MANY = settings(max_examples=400)
+SOME = settings(max_examples=150)
 FEATURES = ("pull_off_force", "pull_off_distance", "zero_force_position", "detachment_position", "detachment_radius")
 
 
@@ -193,7 +193,7 @@ def test_nothing_jumps_where_the_sphere_is_as_wide_as_the_gripper(step):
 
 
 @pytest.mark.soak
-@settings(max_examples=20_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=20_000)
 @given(extreme_scenes(), st.booleans())
 def test_twenty_thousand_extreme_scenes_end_soundly(parameters, contact_stretch):
     assert is_sound(parameters, cone.solve(parameters, contact_stretch=contact_stretch, points=24))

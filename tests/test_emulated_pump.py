@@ -1,7 +1,7 @@
 """The emulated pump, by its bytes."""
 
 import sys
-import time
+from unittest import mock
 
 import pytest
 import serial
@@ -96,11 +96,13 @@ def test_quick_start_gate(world):
     assert host.ask("irate 1 ml/min") == b"\n:"
 
 
-def test_loading_takes_its_time(world):
+def test_loading_takes_its_time(world, monkeypatch):
+    now = [5.0]
+    monkeypatch.setattr("drivers.emulated.pump.time", mock.Mock(monotonic=lambda: now[0]))
     host = Host(EmulatedLegato(world, load_time=0.05))
     host.ask("load qs iw")
     assert b"Command error" in host.ask("irate")
-    time.sleep(0.06)
+    now[0] += 0.06
     assert b"l/min" in host.ask("irate")
 
 
@@ -364,7 +366,7 @@ def test_no_sequence_of_commands_upsets_the_pump(commands):
 @pytest.mark.parametrize("fragment", [None, 1])
 def test_pyserial_reads_until_xon(world, serve, fragment):
     with serve(EmulatedLegato(world), fragment=fragment) as server:
-        port = serial.serial_for_url(server.url, timeout=5)
+        port = serial.serial_for_url(server.url, timeout=60)
         port.write(b"poll on\rver\r")
         assert port.read_until(b"\x11") == b"\n:\x11"
         assert port.read_until(b"\x11") == b"\nLegato 210P 3.0.6\r\n:\x11"
@@ -373,7 +375,7 @@ def test_pyserial_reads_until_xon(world, serve, fragment):
 
 def test_unasked_prompt_comes_by_itself(world):
     with serve_tcp(EmulatedLegato(world, quick_start=True)) as server:
-        port = serial.serial_for_url(server.url, timeout=5)
+        port = serial.serial_for_url(server.url, timeout=60)
         port.write(b"irate 1 ml/min\rtvolume 1 ul\rirun\r")
         assert port.read_until(b">") == b"\n:\n:\n>"
         world.pass_time(1)

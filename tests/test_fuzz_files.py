@@ -139,7 +139,7 @@ def try_to_read(path) -> None:
         assert "\n" not in str(error).strip()
 
 
-@settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(data=st.data())
 def test_a_damaged_recording_is_read_or_refused(data, recorded, tmp_path):
     content = bytearray(recorded)

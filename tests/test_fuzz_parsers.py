@@ -53,7 +53,7 @@ def pump(connection: str) -> LegatoPump:
 
 
 @pytest.mark.parametrize(("opening", "motion"), [(stage, (b"MOV", b"FRF", b"FPL", b"FNL")), (pump, (b"irun", b"wrun"))])
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(answers=st.lists(BYTES, max_size=12))
 def test_an_instrument_that_babbles_is_not_taken_for_one(opening, motion, answers):
     babbler = Babbler(answers)

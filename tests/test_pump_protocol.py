@@ -6,6 +6,7 @@ import pytest
 from dialogue import dialogue
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from links import Script, SerialWire
 
 from drivers.errors import BadReply, CommandRefused, MotionFault, NoReply, OutOfRange, WrongDevice
 from drivers.interfaces import PumpState
@@ -46,7 +47,7 @@ RUNNING = [*START, (b"wrun\r", b"\n<\x11")]
 
 
 def open_pump(url, **options):
-    settings = {"syringe_diameter": 14.43e-3, "force_percent": 50, "settle": 0.0, **options}
+    settings = {"syringe_diameter": 14.43e-3, "force_percent": 50, "settle": 0.0, "reply_timeout": 60.0, **options}
     return LegatoPump(url, **settings)
 
 
@@ -61,6 +62,23 @@ def talk():
                 return action(pump)
             finally:
                 pump.close()
+
+    return run
+
+
+@pytest.fixture
+def talk_past_silence(monkeypatch):
+    """The same in virtual time, for replies that stay away."""
+
+    def run(exchanges, action):
+        script = Script([*CONNECT, *exchanges])
+        wire = SerialWire(script, 0.5)
+        monkeypatch.setattr("drivers.pump.open_port", lambda connection, baud, timeout: wire)
+        monkeypatch.setattr("drivers.pump.time", wire)
+        try:
+            return action(open_pump("fake", reply_timeout=0.5))
+        finally:
+            script.check()
 
     return run
 
@@ -216,20 +234,20 @@ def test_a_pump_that_runs_on_is_reported(talk):
         talk(exchanges, LegatoPump.stop)
 
 
-def test_a_question_is_repeated_once_behind_a_wake_up(talk):
+def test_a_question_is_repeated_once_behind_a_wake_up(talk_past_silence):
     exchanges = [(b"@status\r", b""), WAKE, (b"@status\r", b"\n0 0 0 i...i.\r\n:\x11")]
-    assert talk(exchanges, LegatoPump.status, reply_timeout=0.3).state is PumpState.IDLE
+    assert talk_past_silence(exchanges, LegatoPump.status).state is PumpState.IDLE
 
 
-def test_a_late_reply_is_discarded(talk):
+def test_a_late_reply_is_discarded(talk_past_silence):
     late = b"\n9 9 9000000000 I...i.\r\n>\x11"
     exchanges = [(b"@status\r", b""), (WAKE[0], late + WAKE[1]), (b"@status\r", b"\n0 0 0 i...i.\r\n:\x11")]
-    assert talk(exchanges, LegatoPump.status, reply_timeout=0.3).state is PumpState.IDLE
+    assert talk_past_silence(exchanges, LegatoPump.status).state is PumpState.IDLE
 
 
-def test_a_start_is_never_repeated(talk):
+def test_a_start_is_never_repeated(talk_past_silence):
     with pytest.raises(NoReply, match="'wrun'"):
-        talk([*START, (b"wrun\r", b"")], withdraw, reply_timeout=0.3)
+        talk_past_silence([*START, (b"wrun\r", b"")], withdraw)
 
 
 @pytest.mark.parametrize(

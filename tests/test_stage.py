@@ -8,7 +8,7 @@ import pytest
 from dialogue import flood
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from links import PTY, TERMINALS, BabblingPort, believed, outcomes, stopping, wait_until
+from links import PTY, TERMINALS, BabblingPort, GatewayWire, believed, outcomes, stopping, wait_until
 from motion_world import MotionWorld
 
 import drivers.gateway
@@ -25,6 +25,13 @@ from drivers.errors import (
     WrongDevice,
 )
 from drivers.stage import PIStage
+
+PATIENCE = 60.0
+"""Seconds for a reply that comes: a busy computer is no fault."""
+
+
+def patient(url, **options):
+    return PIStage(url, reply_timeout=PATIENCE, **options)
 
 
 @pytest.fixture
@@ -45,16 +52,25 @@ def server(controller):
 
 @pytest.fixture
 def stage(server):
-    stage = PIStage(server.url, reply_timeout=0.2)
+    stage = patient(server.url)
     yield stage
     stage.close()
+
+
+@pytest.fixture
+def virtual(controller, monkeypatch):
+    """A stage in virtual time, for replies that stay away."""
+    wire = GatewayWire(controller)
+    monkeypatch.setattr("drivers.gateway.open_port", lambda connection, baud: wire)
+    monkeypatch.setattr("drivers.gateway.time", wire)
+    return PIStage("fake", reply_timeout=0.2)
 
 
 @pytest.mark.parametrize("serve", [serve_tcp, PTY])
 @pytest.mark.parametrize("fragment", [None, 1])
 def test_a_move_from_start_to_end(world, controller, serve, fragment):
     with serve(controller, fragment=fragment) as server:
-        stage = PIStage(server.url, clock=lambda: world.time)
+        stage = patient(server.url, clock=lambda: world.time)
         stage.set_speed(2e-3)
         stage.move_to(24e-3)
         world.pass_time(0.5)
@@ -80,7 +96,7 @@ def test_look_ahead_extends_a_running_move(stage, world):
 
 
 def test_from_outside_the_travel_the_axis_may_come_back_and_go_no_further(server, world):
-    stage = PIStage(server.url, minimum=10e-3, maximum=20e-3)
+    stage = patient(server.url, minimum=10e-3, maximum=20e-3)
     with pytest.raises(OutOfRange):
         stage.move_to(21e-3)  # nobody has asked where it is
     assert stage.status().position == pytest.approx(22e-3)
@@ -115,7 +131,7 @@ def test_emergency_stop_stops_dead_and_is_acknowledged_by_stop(stage, world):
 
 
 def test_emergency_stop_passes_a_transaction_that_waits_for_its_reply(world, controller, server):
-    stage = PIStage(server.url, reply_timeout=30)
+    stage = patient(server.url)
     stage.move_to(40e-3)
     world.fail("stage", "silent")
 
@@ -165,7 +181,7 @@ def test_stop_from_another_thread_is_no_fault_of_the_controller(stage, world):
 
 def test_referencing_moves_away_from_the_sample(world):
     with serve_tcp(EmulatedController(world)) as server:
-        stage = PIStage(server.url)
+        stage = patient(server.url)
         assert not stage.referenced
         with pytest.raises(CommandRefused, match="unreferenced"):
             stage.move_to(23e-3)
@@ -180,7 +196,7 @@ def test_referencing_moves_away_from_the_sample(world):
 
 
 def test_inverted_axis(world, controller, server):
-    stage = PIStage(server.url, inverted=True, minimum=-40e-3)
+    stage = patient(server.url, inverted=True, minimum=-40e-3)
     assert stage.travel == pytest.approx((-40e-3, 0))
     stage.move_to(-21e-3)
     world.pass_time(5)
@@ -208,26 +224,26 @@ def test_a_silent_box_is_noticed_within_one_timeout(world, controller, server):
 
 def test_wrong_model(server):
     with pytest.raises(WrongDevice, match=r"C-863\.12.*expects 'C-884'"):
-        PIStage(server.url, expected_model="C-884")
+        patient(server.url, expected_model="C-884")
 
 
 def test_wrong_axis(server):
     with pytest.raises(WrongDevice, match="names 'X'"):
-        PIStage(server.url, axis="X")
+        patient(server.url, axis="X")
 
 
 def test_a_second_program_is_refused(stage, server):
     with pytest.raises(NotConnected):
-        PIStage(server.url)
+        patient(server.url)
     assert stage.referenced
 
 
 @TERMINALS
 def test_a_second_program_on_the_serial_port_is_refused(controller):
     with serve_pty(controller) as server:
-        stage = PIStage(server.url)
+        stage = patient(server.url)
         with pytest.raises(NotConnected, match="exclusively lock"):
-            PIStage(server.url)
+            patient(server.url)
         stage.close()
 
 
@@ -242,7 +258,7 @@ def test_closing_twice_and_using_it_afterwards(stage):
 
 def test_reconnecting_in_the_same_process(server):
     for _ in range(5):
-        stage = PIStage(server.url)
+        stage = patient(server.url)
         assert stage.status().servo_on
         stage.close()
 
@@ -266,7 +282,8 @@ def test_reconnecting_in_the_same_process(server):
         ("rebooted", 0, MotionFault),
     ],
 )
-def test_every_fault_becomes_one_clear_error(stage, world, kind, value, error):
+def test_every_fault_becomes_one_clear_error(virtual, world, kind, value, error):
+    stage = virtual
     stage.move_to(40e-3)
     world.pass_time(0.5)
     world.fail("stage", kind, value)
@@ -320,7 +337,7 @@ def test_a_pressed_limit_switch_is_reported_until_the_stage_moves_away(stage, wo
 
 def test_limit_switches_that_are_active_low(world):
     with serve_tcp(EmulatedController(world, referenced=True, limit_bits_inverted=True)) as server:
-        stage = PIStage(server.url)
+        stage = patient(server.url)
         status = stage.status()
         assert (status.positive_limit, status.negative_limit) == (False, False)
         world.fail("stage", "limit_switch", -1)
@@ -333,7 +350,7 @@ def test_limit_switches_that_are_active_low(world):
 def test_somebody_elses_stop_is_reported(world, monkeypatch, after):
     controller = EmulatedController(world, referenced=True)
     with serve_tcp(controller) as server:
-        stage = PIStage(server.url)
+        stage = patient(server.url)
         if after != "nothing":
             with monkeypatch.context() as cut:
                 cut.setattr(stage._gateway, "send_urgent", mock.Mock(side_effect=ConnectionResetError))
@@ -349,8 +366,9 @@ def test_somebody_elses_stop_is_reported(world, monkeypatch, after):
 
 
 @pytest.mark.parametrize("kind", ["silent", "slow", "late", "garbage"])
-def test_no_stale_reply_is_ever_believed(stage, world, kind):
+def test_no_stale_reply_is_ever_believed(virtual, world, kind):
     """While replies go astray and afterwards, a position that is returned is the present one."""
+    stage = virtual
     stage.set_speed(5e-3)
     stage.move_to(50e-3)
 
@@ -365,7 +383,8 @@ def test_no_stale_reply_is_ever_believed(stage, world, kind):
     assert positions >= 4
 
 
-def test_stop_reaches_a_controller_whose_replies_are_lost(stage, world):
+def test_stop_reaches_a_controller_whose_replies_are_lost(virtual, world):
+    stage = virtual
     stage.move_to(40e-3)
     world.fail("stage", "silent")
     with pytest.raises(NoReply, match="confirm the halt"):
@@ -386,7 +405,7 @@ def test_unplugged_cable_is_noticed_by_every_call(stage, world):
 @TERMINALS
 def test_serial_adapter_pulled_out(world, controller):
     with serve_pty(controller) as server:
-        stage = PIStage(server.url, reply_timeout=0.2)
+        stage = patient(server.url)
         world.fail("stage", "unplugged")
         for _ in range(3):
             with pytest.raises((NotConnected, NoReply)):

@@ -2,6 +2,7 @@
 
 import pytest
 from dialogue import dialogue
+from links import GatewayWire, Script
 
 from drivers.errors import BadReply, CommandRefused, MotionFault, NoReply, OutOfRange, WrongDevice
 from drivers.stage import PIStage
@@ -22,7 +23,7 @@ CONNECT = [
 
 def test_connection_identifies_the_controller_and_moves_nothing():
     with dialogue(CONNECT) as url:
-        stage = PIStage(url)
+        stage = PIStage(url, reply_timeout=60.0)
         assert stage.identity.model == "C-863.12"
         assert stage.identity.serial == "0021550019"
         assert stage.travel == pytest.approx((0.0, 0.052))
@@ -32,7 +33,7 @@ def test_connection_identifies_the_controller_and_moves_nothing():
 def test_errors_left_by_an_earlier_program_are_read_away():
     exchanges = [CONNECT[0], (b"ERR?\n", b"10\n"), *CONNECT[1:]]
     with dialogue(exchanges) as url:
-        PIStage(url).close()
+        PIStage(url, reply_timeout=60.0).close()
 
 
 @pytest.mark.parametrize(
@@ -47,7 +48,7 @@ def test_errors_left_by_an_earlier_program_are_read_away():
 )
 def test_another_device_is_refused(identity, error):
     with dialogue([(b"\n*IDN?\n", identity)]) as url, pytest.raises(WrongDevice, match=error):
-        PIStage(url)
+        PIStage(url, reply_timeout=60.0)
 
 
 def test_a_missing_axis_is_refused():
@@ -55,19 +56,19 @@ def test_a_missing_axis_is_refused():
         dialogue([*CONNECT[:2], (b"SAI?\n", b"A \nB\n"), CONNECT[3]]) as url,
         pytest.raises(WrongDevice, match=r"\['A', 'B'\]"),
     ):
-        PIStage(url)
+        PIStage(url, reply_timeout=60.0)
 
 
 def test_limits_are_the_narrower_of_controller_and_bench():
     with dialogue(CONNECT) as url:
-        stage = PIStage(url, minimum=0.010, maximum=0.1)
+        stage = PIStage(url, reply_timeout=60.0, minimum=0.010, maximum=0.1)
         assert stage.travel == pytest.approx((0.010, 0.052))
         stage.close()
 
 
 def test_limits_without_overlap_are_refused():
     with dialogue(CONNECT[:6]) as url, pytest.raises(OutOfRange, match="nothing in common"):
-        PIStage(url, minimum=0.1)
+        PIStage(url, reply_timeout=60.0, minimum=0.1)
 
 
 @pytest.fixture
@@ -76,11 +77,28 @@ def talk():
 
     def run(exchanges, action, **options):
         with dialogue([*CONNECT, *exchanges]) as url:
-            stage = PIStage(url, **options)
+            stage = PIStage(url, reply_timeout=60.0, **options)
             try:
                 return action(stage)
             finally:
                 stage.close()
+
+    return run
+
+
+@pytest.fixture
+def talk_past_silence(monkeypatch):
+    """The same in virtual time, for replies that stay away."""
+
+    def run(exchanges, action):
+        script = Script([*CONNECT, *exchanges])
+        wire = GatewayWire(script)
+        monkeypatch.setattr("drivers.gateway.open_port", lambda connection, baud: wire)
+        monkeypatch.setattr("drivers.gateway.time", wire)
+        try:
+            return action(PIStage("fake"))
+        finally:
+            script.check()
 
     return run
 
@@ -214,7 +232,7 @@ def test_a_status_word_that_makes_no_sense_is_refused(talk, reply):
         talk([(b"\x04", reply)], PIStage.status)
 
 
-def test_after_a_missing_reply_every_late_one_is_discarded(talk):
+def test_after_a_missing_reply_every_late_one_is_discarded(talk_past_silence):
     """The reply to the first question comes with the landmark and must not answer the second question."""
     exchanges = [
         (b"\x04", b"0x9000\n"),
@@ -229,10 +247,10 @@ def test_after_a_missing_reply_every_late_one_is_discarded(talk):
             stage.status()
         return stage.status()
 
-    assert talk(exchanges, poll_twice, reply_timeout=0.3).position == pytest.approx(0.012)
+    assert talk_past_silence(exchanges, poll_twice).position == pytest.approx(0.012)
 
 
-def test_a_late_landmark_does_not_end_the_next_search(talk):
+def test_a_late_landmark_does_not_end_the_next_search(talk_past_silence):
     exchanges = [
         (b"\x04", b""),
         (b"*IDN?\n", b""),
@@ -247,4 +265,4 @@ def test_a_late_landmark_does_not_end_the_next_search(talk):
                 stage.status()
         return stage.status()
 
-    assert talk(exchanges, poll, reply_timeout=0.3).position == pytest.approx(0.012)
+    assert talk_past_silence(exchanges, poll).position == pytest.approx(0.012)

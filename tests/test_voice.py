@@ -13,6 +13,12 @@ from rig.terminal import Terminal
 from rig.voice import MOST_WAITING, Voice
 
 
+@pytest.fixture
+def heard(monkeypatch):
+    """Wait for the last words however long a busy computer takes over them."""
+    monkeypatch.setattr("rig.voice.LAST_WORDS_S", 60.0)
+
+
 class Frozen(io.StringIO):
     """A terminal after Ctrl-S."""
 
@@ -33,6 +39,7 @@ def test_a_terminal_that_takes_no_output_does_not_hold_a_run(request_for):
     stream.go_on.set()
 
 
+@pytest.mark.usefixtures("heard")
 def test_what_a_terminal_is_behind_with_is_bounded_and_said_in_order():
     stream = Frozen()
     voice = Voice(stream)
@@ -45,6 +52,7 @@ def test_what_a_terminal_is_behind_with_is_bounded_and_said_in_order():
     assert len(said) <= MOST_WAITING + 1
 
 
+@pytest.mark.usefixtures("heard")
 def test_all_is_said_when_a_run_has_ended_and_the_next_one_is_heard_too():
     stream = io.StringIO()
     terminal = Terminal(Voice(stream))
@@ -54,6 +62,7 @@ def test_all_is_said_when_a_run_has_ended_and_the_next_one_is_heard_too():
         assert stream.getvalue().endswith(f"ended: {reason}\n")
 
 
+@pytest.mark.usefixtures("heard")
 def test_a_terminal_that_is_gone_is_told_to_whoever_speaks_next():
     stream = io.StringIO()
     voice = Voice(stream)

@@ -272,7 +272,7 @@ class _TcpServer:
             self._sessions = {thread: end for thread, end in self._sessions.items() if thread.is_alive()}
             if len(self._sessions) < self._hosts:
                 return True
-            if time.monotonic() >= deadline:
+            if time.monotonic() >= deadline and not any(map(_has_left, self._sessions.values())):
                 return False
             next(iter(self._sessions)).join(LEAVING_PATIENCE / 10)
 
@@ -296,6 +296,18 @@ class _TcpServer:
         finally:
             line.close()
             connection.close()
+
+
+def _has_left(connection: socket.socket) -> bool:
+    """Whether the host has hung up, though its session has yet to notice; Windows does not tell."""
+    if sys.platform == "win32":
+        return False
+    try:
+        return not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except (BlockingIOError, TimeoutError):
+        return False
+    except OSError:
+        return True
 
 
 def serve_pty(instrument: Instrument, *, fragment: int | None = None) -> Server:
