@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 from conftest import scene_text
+from held_run import held
 
 from rig.campaign import JOURNAL, Journal, load_campaign, single
 from rig.cli import main
@@ -101,16 +99,11 @@ def test_a_finished_campaign_is_not_measured_again(tmp_path, campaign, capsys):
 
 def test_a_campaign_killed_half_way_is_taken_up_where_it_stopped(tmp_path, campaign):
     folder = tmp_path / "out"
-    command = [sys.executable, "-m", "rig", "campaign", str(campaign), "--direct", "--out", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not ((folder / JOURNAL).exists() and len(journal(folder)) >= 2):
-        assert process.poll() is None
-        time.sleep(0.002)
-    process.kill()
-    process.wait()
+    with held(3, 5, "campaign", campaign, "--direct", "--out", folder) as process:
+        process.kill()
     done = [entry["key"] for entry in journal(folder)]
     whole = {name: (folder / name).read_bytes() for name in (entry["recording"] for entry in journal(folder))}
-    assert len(done) < 5
+    assert len(done) == 2
     assert run(campaign, folder) == 0
     entries = journal(folder)
     assert [entry["key"] for entry in entries][: len(done)] == done
@@ -173,13 +166,11 @@ def test_a_whole_recording_without_an_entry_is_adopted_and_a_broken_one_is_kept(
 @pytest.mark.skipif(os.name != "posix", reason="sends a signal to a process")
 def test_ctrl_c_ends_a_campaign_and_leaves_it_to_be_taken_up(tmp_path, campaign):
     folder = tmp_path / "out"
-    command = [sys.executable, "-m", "rig", "campaign", str(campaign), "--direct", "--out", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    while not ((folder / JOURNAL).exists() and journal(folder)):
-        time.sleep(0.002)
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate()
-    assert process.returncode != 0
+    with held(2, 5, "campaign", campaign, "--direct", "--out", folder) as process:
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate("\n")
+    assert process.returncode == 130
+    assert len(journal(folder)) == 1
     assert "Traceback" not in error
     assert run(campaign, folder) == 0
     assert sorted(entry["key"] for entry in journal(folder)) == sorted(keys(campaign))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from unittest.mock import patch
 
 import h5py
 import numpy as np
 import pytest
+from held_run import held
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -61,29 +61,21 @@ def test_the_raw_values_of_each_instrument_carry_their_own_unit(request_for):
 
 def test_a_killed_writer_loses_nothing_it_acknowledged(tmp_path):
     path = tmp_path / "killed.h5"
-    with subprocess.Popen(
-        [sys.executable, "-m", "rig", "run", "sphere-60mm-vented", "--direct", "--out", str(path), "--no-live"],
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as writer:
-        while not path.exists():
-            time.sleep(0.01)
-        with_data = 0
-        while with_data < 2000:
-            time.sleep(0.05)
-            with h5py.File(path, "r", swmr=True, libver="latest") as file:
-                with_data = file["entry/data/force"].shape[0] if "entry" in file else 0
-                volts = file["entry/raw/volts"][: with_data - 20] if with_data else None
+    words = ("run", "sphere-60mm-vented", "--direct", "--no-live", "--out", path)
+    with held(1, 200, *words) as writer:
+        with h5py.File(path, "r", swmr=True, libver="latest") as file:
+            with_data = file["entry/data/force"].shape[0]
+            volts = file["entry/raw/volts"][:with_data]
+        assert with_data == 201 * 20
         with pytest.raises(BeingWritten, match="Remedy: wait"):
             recover(path)
         writer.kill()
-        writer.communicate()
     with pytest.raises(OSError, match="already open"):
         h5py.File(path, "r")
     recording = load_recording(path)
     with h5py.File(path, "r") as file:  # a plain open works now
-        assert file["entry/data/force"].shape[0] == recording.force.size >= with_data - 20
-    assert np.array_equal(recording.volts.T[: with_data - 20], volts)
+        assert file["entry/data/force"].shape[0] == recording.force.size == with_data
+    assert np.array_equal(recording.volts.T, volts)
     assert recording.ending == ("the program died; recovered", -9)
 
 

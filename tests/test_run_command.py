@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from conftest import SHORT, scene_text
+from held_run import held
 
 from rig.cli import main
 from rig.journal import journal_of
@@ -131,19 +132,14 @@ def test_an_interlock_keeps_its_exit_code_where_nobody_reads(scene, tmp_path, cl
 @pytest.mark.parametrize("ignored", [False, True], ids=["window-closed", "nohup"])
 def test_a_closed_terminal_ends_the_run_in_good_order(scene, tmp_path, ignored):
     out = tmp_path / "h.h5"
-    command = [*RIG, "run", str(scene), "--direct", "--no-live", "--no-picture", "--out", str(out)]
-    command += ["--speed", "max" if ignored else "20"]
+    words = ("run", scene, "--direct", "--no-live", "--no-picture", "--out", out)
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
     try:
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        with held(1, 100, *words) as process:
+            process.send_signal(signal.SIGHUP)
+            process.communicate("\n")
     finally:
         signal.signal(signal.SIGHUP, before)
-    with process:
-        assert process.stderr is not None
-        while "approach" not in process.stderr.readline():
-            pass
-        process.send_signal(signal.SIGHUP)
-        process.stderr.read()
     assert process.returncode == (0 if ignored else 130)
     ending = load_recording(out).ending
     assert ending is not None
