@@ -16,6 +16,7 @@ import numpy as np
 from conftest import scene_text
 
 from rig.bench import load_bench
+from rig.recording import load_recording
 
 EMULATOR = Path(__file__).with_name("emulator_process.py")
 PROTOCOL = {"tare_s": 0.5, "preload_dwell_s": 0.5, "preload_N": 0.3, "retract_speed_um_s": 100.0}
@@ -43,7 +44,7 @@ class Halt:
 
 
 class Overtaken(Exception):
-    """This computer was too busy for real time: the run has stopped itself before it could be killed."""
+    """This computer was too busy for real time: the run has stopped itself, or gone on, before it could be killed."""
 
 
 @contextlib.contextmanager
@@ -75,7 +76,8 @@ def bench_file(folder: Path, ends: dict[str, str], **daq: float) -> Path:
     """Write a bench file whose instruments are these endpoints."""
     text = load_bench(None)[1]
     for device in ("stage", "pump", "daq"):
-        text = text.replace('connection = "emulated"', f'connection = "{ends[device]}"', 1)
+        patient = "" if device == "daq" else "\nreply_timeout_ms = 5000.0"
+        text = text.replace('connection = "emulated"', f'connection = "{ends[device]}"{patient}', 1)
     for key, value in daq.items():
         lines = (f"{key} = {value}" if line.startswith(f"{key} ") else line for line in text.splitlines())
         text = "\n".join(lines) + "\n"
@@ -103,7 +105,7 @@ def wait_for_step(stream: IO[str], step: str) -> None:
         if f" s  {step} " in line and "until" in line:
             return
     text = "".join(said)
-    if "s late" in text:
+    if "s late" in text or "samples came within" in text:
         raise Overtaken(text)
     raise AssertionError(f"the run never came to {step}: {text}")
 
@@ -129,15 +131,19 @@ def _kill_in(step: str, delay: float, folder: Path, seed: int) -> Halt:
                 killed = time.monotonic()
         time.sleep(SETTLING)
         log = np.array(finish()["log"])
+    if load_recording(folder / "run.h5").step_table()[-1].name != step:
+        raise Overtaken(step)
     return _halt(log, killed, step, delay, folder / "run.h5")
 
 
 def _halt(log: np.ndarray, killed: float, step: str, delay: float, recording: Path) -> Halt:
-    when, _, height, volume, low, high = log.T
-    before, after = when <= killed, when >= killed
-    at = height[before][-1]
-    span = when[before] > killed - 0.1
-    rate = np.polyfit(when[before][span], height[before][span], 1)[0] if span.sum() > 2 else 0.0
+    when, sample, height, volume, low, high = log.T
+    before = when <= killed
+    present = sample[before][-1] + (killed - when[before][-1]) * 1e3  # a busy emulator writes its log late
+    after = sample >= present
+    at = np.interp(present, sample, height)
+    recent = slice(-max(3, int((sample[before] > present - 100).sum())), None)
+    rate = np.polyfit(sample[before][recent] * 1e-3, height[before][recent], 1)[0]
     last = when > when[-1] - 1.0
     largest = max(-low.min(), high.max())
     return Halt(

@@ -19,6 +19,10 @@ from rig.errors import FileError
 from rig.fault_script import known_faults, load_faults
 
 
+PATIENCE = 60.0
+"""Seconds for what comes: a busy computer is no fault."""
+
+
 def imported_by(program: str) -> set[str]:
     """The modules a fresh interpreter has after running a program."""
     code = f"{program}\nimport sys; print(*sys.modules)"
@@ -74,16 +78,18 @@ def test_wires_and_direct_devices_exclude_each_other():
 
 
 def test_closing_frees_the_ports_and_may_be_repeated():
-    import socket
+    import psutil
+
+    def listening() -> set[int]:
+        return {end.laddr.port for end in psutil.Process().net_connections("inet") if end.status == psutil.CONN_LISTEN}
 
     bench = EmulatedBench(Truth.pull_off())
-    ports = [int(end.rpartition(":")[2]) for end in (bench.endpoints.stage, bench.endpoints.pump, bench.endpoints.daq)]
+    ports = {int(end.rpartition(":")[2]) for end in (bench.endpoints.stage, bench.endpoints.pump, bench.endpoints.daq)}
+    assert ports <= listening()
     assert bench.endpoints is bench.endpoints
     bench.close()
     bench.close()
-    for port in ports:
-        with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(("127.0.0.1", port), timeout=1).close()
+    assert not ports & listening()
 
 
 def test_virtual_time_is_the_plants_and_real_time_runs_by_itself():
@@ -95,11 +101,11 @@ def test_virtual_time_is_the_plants_and_real_time_runs_by_itself():
         assert bench.clock() == pytest.approx(0.5)
     with EmulatedBench(Truth.pull_off(), wire=False, speed=50.0) as bench:
         assert not bench.virtual
-        daq = bench.daq("force")
+        daq = bench.daq("force", buffer_seconds=10_000.0, patience=PATIENCE)
         daq.start()
         assert daq.read(1000).shape == (1, 1000)
         reached = bench.plant.time
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 200
         while bench.plant.time < reached + 0.5 and time.monotonic() < deadline:
             time.sleep(0.01)
         assert bench.plant.time > reached + 0.4
@@ -126,7 +132,7 @@ def emulate(*options: str) -> subprocess.Popen[str]:
 
 def interrupt(process: subprocess.Popen[str]) -> tuple[str, str, int]:
     process.send_signal(signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate()
     return out, err, process.returncode
 
 
@@ -142,9 +148,17 @@ def test_emulate_prints_one_line_serves_and_ends_on_ctrl_c(terminals):
     ends = json.loads(process.stdout.readline())
     expected = {"stage", "pump", "daq"} | ({"stage_pty", "pump_pty"} if terminals else set())
     assert set(ends) == expected
-    stage = PIStage(ends["stage_pty" if terminals else "stage"])
-    pump = LegatoPump(ends["pump_pty" if terminals else "pump"], syringe_diameter=14.43e-3, force_percent=50)
-    daq = NIDaq([VoltageChannel("force", "Dev1/ai0")], rate=1000.0, connection=f"grpc://{ends['daq']}")
+    stage = PIStage(ends["stage_pty" if terminals else "stage"], reply_timeout=PATIENCE)
+    pump = LegatoPump(
+        ends["pump_pty" if terminals else "pump"], syringe_diameter=14.43e-3, force_percent=50, reply_timeout=PATIENCE
+    )
+    daq = NIDaq(
+        [VoltageChannel("force", "Dev1/ai0")],
+        rate=1000.0,
+        connection=f"grpc://{ends['daq']}",
+        buffer_seconds=10_000.0,
+        patience=PATIENCE,
+    )
     try:
         assert not stage.referenced
         assert not stage.status().servo_on
@@ -168,7 +182,7 @@ def test_emulate_prints_one_line_serves_and_ends_on_ctrl_c(terminals):
 )
 def test_emulate_explains_what_is_wrong(options, words):
     process = emulate(*options)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate()
     assert process.returncode == 2
     assert out == ""
     assert len(err.splitlines()) == 1

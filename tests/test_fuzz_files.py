@@ -141,7 +141,8 @@ def try_to_read(path) -> None:
 
 @settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_damaged_recording_is_read_or_refused(data, recorded, tmp_path):
+def test_a_damaged_recording_is_read_or_refused(data, recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr("rig.seal.PROBE_SECONDS", 3.0)
     content = bytearray(recorded)
     for _ in range(data.draw(st.integers(1, 8))):
         content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))

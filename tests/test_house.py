@@ -17,7 +17,6 @@ def run(*command: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     "command",
     [

@@ -96,7 +96,9 @@ def test_foreign_hdf5_is_refused(tmp_path):
         pass
 
 
-def test_a_bit_flip_never_crashes_the_reader(request_for):
+def test_a_bit_flip_never_crashes_the_reader(request_for, monkeypatch):
+    monkeypatch.setattr("rig.seal.PROBE_SECONDS", 3.0)
+    monkeypatch.setattr("rig.seal.SLEEP_SECONDS", 1.0)
     request = request_for()
     run_scene(request)
     whole = request.out.read_bytes()
