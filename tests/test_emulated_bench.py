@@ -18,7 +18,6 @@ from drivers.emulated.truth import Truth
 from rig.errors import FileError
 from rig.fault_script import known_faults, load_faults
 
-
 PATIENCE = 60.0
 """Seconds for what comes: a busy computer is no fault."""
 
