@@ -123,12 +123,18 @@ def _tests(campaign: Campaign, folder: Path) -> Iterator[PlannedTest]:
         name = section.name or Path(source).stem
         stem = f"{number + 1:02d}-{_word(name)}"
         if section.initial_pressures_kPa is None:
-            yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt, always=True)
+            yield from _places(scene, text, stem, repeats, campaign.seed, section.prompt, in_campaign=True)
             continue
         for pressure in section.initial_pressures_kPa:
             changed, changed_text = _at_pressure(text, name, pressure, f"{source} at {pressure:g} kPa")
             yield from _places(
-                changed, changed_text, f"{stem}_{pressure:+g}kPa", repeats, campaign.seed, section.prompt, always=True
+                changed,
+                changed_text,
+                f"{stem}_{pressure:+g}kPa",
+                repeats,
+                campaign.seed,
+                section.prompt,
+                in_campaign=True,
             )
 
 
@@ -142,15 +148,19 @@ def _at_pressure(text: str, name: str, pressure: float, source: str) -> tuple[Sc
 
 
 def _places(
-    scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str, *, always: bool = False
+    scene: Scene, text: str, stem: str, repeats: int, seed: int, prompt: str, *, in_campaign: bool = False
 ) -> Iterator[PlannedTest]:
-    """Yield the tests at each place; ``always`` numbers them even if there is one: more may be asked for later."""
+    """Yield the tests at each place.
+
+    A campaign numbers them even if there is one, since more may be asked for later, and gives each a seed of its own:
+    repeats of different conditions must not share their noise.
+    """
     places: Sequence[str] = getattr(scene.protocol, "positions", ("",))
     repeats = max(repeats, getattr(scene.protocol, "repeats", 1))
     for index, place in enumerate(places):
         hands = prompt if not place else " ".join(filter(None, (prompt, f"Bring the probe over {place}.")))
         for repeat in range(1, repeats + 1):
-            parts = [stem, _word(place), f"{repeat}" if always or repeats > 1 else ""]
+            parts = [stem, _word(place), f"{repeat}" if in_campaign or repeats > 1 else ""]
             key = "-".join(filter(None, parts))
             yield PlannedTest(
                 key=key,
@@ -159,10 +169,14 @@ def _places(
                 place=place,
                 repeat=repeat,
                 repeats=repeats,
-                seed=seed + 1000 * index + repeat - 1,
+                seed=_seed(seed, key) if in_campaign else seed + 1000 * index + repeat - 1,
                 setup=f"{stem.split('-', maxsplit=1)[0]} {place}",
                 prompt=hands,
             )
+
+
+def _seed(campaign: int, key: str) -> int:
+    return int(hashlib.sha256(f"{campaign}\0{key}".encode()).hexdigest()[:8], 16)
 
 
 def _word(place: str) -> str:

@@ -88,6 +88,21 @@ def test_places_and_repeats_of_a_scene_have_seeds_and_prompts_of_their_own(tmp_p
     assert len({test.setup for test in tests}) == 3
 
 
+def test_no_two_tests_of_a_campaign_share_their_noise(tmp_path):
+    (tmp_path / "zero.toml").write_text(scene_text("pressure-zero", rest_s=0.5), "utf-8")
+    path = tmp_path / "c.toml"
+    text = 'title = "c"\nrepeats = 2\n[[test]]\nscene = "zero.toml"\n[[test]]\nscene = "zero.toml"\n'
+    path.write_text(text, "utf-8")
+    assert run(path, tmp_path / "out") == 0
+    force = {load_recording(file).volts[:100].tobytes() for file in (tmp_path / "out").glob("*.h5")}
+    assert len(force) == 4
+    before = {test.key: test.seed for test in load_campaign(path)[1]}
+    path.write_text(text.replace("repeats = 2", "repeats = 3"), "utf-8")
+    assert before.items() <= {test.key: test.seed for test in load_campaign(path)[1]}.items()
+    path.write_text("seed = 1\n" + text, "utf-8")
+    assert not set(before.values()) & {test.seed for test in load_campaign(path)[1]}
+
+
 def test_a_finished_campaign_is_not_measured_again(tmp_path, campaign, capsys):
     folder = tmp_path / "out"
     assert run(campaign, folder) == 0
