@@ -116,7 +116,8 @@ class PIStage:
         self._direction = -1e-3 if inverted else 1e-3
         self._clock = clock
         self._lock = threading.RLock()
-        self._stop_pressed = threading.Event()
+        # A plain flag: the emergency stop may come from a signal handler while this thread holds an event's lock.
+        self._stop_pressed = False
         self._halting = False
         self._out_of_step = False
         self._landmarks = 0
@@ -250,14 +251,14 @@ class PIStage:
             self._halting = False
 
     def _confirm_halt(self) -> None:
-        pressed = self._stop_pressed.is_set()
+        pressed = self._stop_pressed
         try:
             with self._exchange("confirm the halt", check=False):
-                self._stop_pressed.clear()
+                self._stop_pressed = False
                 self._read_errors_away()
         except DeviceError:
             if pressed:
-                self._stop_pressed.set()
+                self._stop_pressed = True
             self._send_urgent(STOP_EVERYTHING)
             raise
 
@@ -266,7 +267,7 @@ class PIStage:
 
         Moves are refused from now on, until ``stop`` acknowledges.
         """
-        self._stop_pressed.set()
+        self._stop_pressed = True
         self._send_urgent(STOP_EVERYTHING)
 
     def close(self) -> None:
@@ -360,7 +361,7 @@ class PIStage:
 
     @property
     def _stop_is_ours(self) -> bool:
-        return self._halting or self._stop_pressed.is_set()
+        return self._halting or self._stop_pressed
 
     def _servo_lost(self) -> MotionFault:
         if self._was_referenced and not self.referenced:
@@ -379,7 +380,7 @@ class PIStage:
     def _error_of(self, code: int, purpose: str = "") -> DeviceError:
         """Return the error to raise for a code of the controller."""
         message = f"cannot {purpose}: {self._describe(code)}" if purpose else self._describe(code)
-        if code == STOPPED and self._stop_pressed.is_set():
+        if code == STOPPED and self._stop_pressed:
             return self._stop_was_pressed()
         kind = MotionFault if code in (STOPPED, *MOTION_ERRORS) else CommandRefused
         return kind(DEVICE, message, REMEDIES.get(code, LOOK_UP))
@@ -388,15 +389,18 @@ class PIStage:
     def _stop_was_pressed() -> MotionFault:
         return MotionFault(DEVICE, "the emergency stop was pressed", "call stop() to acknowledge it, then move")
 
+    def _refuse_if_stopped(self) -> None:
+        if self._stop_pressed:
+            raise self._stop_was_pressed()
+
     @contextlib.contextmanager
     def _unless_stopped(self) -> Iterator[None]:
         """Refuse a move after an emergency stop; stop again behind a move that the stop has overtaken."""
-        if self._stop_pressed.is_set():
-            raise self._stop_was_pressed()
+        self._refuse_if_stopped()
         try:
             yield
         finally:
-            if self._stop_pressed.is_set():
+            if self._stop_pressed:
                 self._send_urgent(STOP_EVERYTHING)
                 raise self._stop_was_pressed()
 

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
+from drivers.errors import MotionFault
 from drivers.interfaces import Identity, Pump, PumpStatus, Stage, StageStatus
 
 Log = Callable[[str], None]
 
 
-class CommandedStage:
-    """A ``Stage`` that logs its commands."""
+def _nothing() -> None:
+    """Allow every motion."""
 
-    def __init__(self, stage: Stage, log: Log) -> None:
+
+class CommandedStage:
+    """A ``Stage`` that logs its commands.
+
+    Parameters
+    ----------
+    insist
+        Raises where nothing may be set in motion any more: an emergency stop may come between any two commands, and
+        the stop with which a step ends would acknowledge it to the driver.
+    """
+
+    def __init__(self, stage: Stage, log: Log, insist: Callable[[], None] = _nothing) -> None:
         self._stage = stage
         self._log = log
+        self._insist = insist
 
     @property
     def identity(self) -> Identity:
@@ -34,7 +48,8 @@ class CommandedStage:
     def reference(self) -> None:
         """See ``Stage``."""
         self._log("stage: reference")
-        self._stage.reference()
+        with self._permitted():
+            self._stage.reference()
 
     def servo(self, on: bool) -> None:
         """See ``Stage``."""
@@ -48,12 +63,14 @@ class CommandedStage:
     def set_speed(self, speed: float) -> None:
         """See ``Stage``."""
         self._log(f"stage: speed {speed * 1e6:.6g} um/s")
-        self._stage.set_speed(speed)
+        with self._permitted():
+            self._stage.set_speed(speed)
 
     def move_to(self, position: float) -> None:
         """See ``Stage``."""
         self._log(f"stage: move to {position * 1e3:.6f} mm")
-        self._stage.move_to(position)
+        with self._permitted():
+            self._stage.move_to(position)
 
     def stop(self) -> None:
         """See ``Stage``."""
@@ -68,13 +85,23 @@ class CommandedStage:
         """See ``Stage``."""
         self._stage.close()
 
+    @contextmanager
+    def _permitted(self) -> Iterator[None]:
+        self._insist()
+        try:
+            yield
+        except MotionFault:
+            self._insist()  # it may be the emergency stop that the driver names
+            raise
+
 
 class CommandedPump:
-    """A ``Pump`` that logs its commands."""
+    """A ``Pump`` that logs its commands; ``insist`` as for ``CommandedStage``."""
 
-    def __init__(self, pump: Pump, log: Log) -> None:
+    def __init__(self, pump: Pump, log: Log, insist: Callable[[], None] = _nothing) -> None:
         self._pump = pump
         self._log = log
+        self._insist = insist
 
     @property
     def identity(self) -> Identity:
@@ -93,6 +120,7 @@ class CommandedPump:
     def dispense(self, volume: float, rate: float) -> None:
         """See ``Pump``."""
         self._log(f"pump: dispense {volume * 1e6:+.6f} ml at {rate * 6e7:.6g} ml/min")
+        self._insist()
         self._pump.dispense(volume, rate)
 
     def stop(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -142,12 +142,18 @@ class Wish(StrEnum):
 
 
 class Controls:
-    """The operator's hand on the run. Safe from any thread; the loop looks at it once a frame."""
+    """The operator's hand on the run. Safe from any thread and any signal handler; the loop looks at it once a frame.
+
+    There is no lock: a signal handler runs on the loop's thread, which may be just in here, and would wait for itself.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._wish = Wish.NONE
+        self._wishes: deque[Wish] = deque()
         self._stop_now: Callable[[], None] | None = None
+        self.ending = False
+        """Whether a stop has ever been asked for; no further run is begun then."""
+        self.emergency = False
+        """Whether the emergency stop has ever been pressed; nothing is set in motion then."""
 
     def connect(self, stop_now: Callable[[], None] | None) -> None:
         """Give the action of the emergency stop: it writes to the instruments from the caller's thread."""
@@ -155,33 +161,26 @@ class Controls:
 
     def hold(self) -> None:
         """Stop the motion and wait; data keep coming."""
-        self._ask(Wish.HOLD)
+        self._wishes.append(Wish.HOLD)
 
     def resume(self) -> None:
         """Go on after a hold."""
-        self._ask(Wish.RESUME)
+        self._wishes.append(Wish.RESUME)
 
     def stop(self) -> None:
         """End the run in good order."""
-        self._ask(Wish.STOP)
+        self.ending = True
+        self._wishes.append(Wish.STOP)
 
     def emergency_stop(self) -> None:
         """Stop the stage at once from this thread, then end the run."""
-        self._ask(Wish.EMERGENCY)
+        self.ending = self.emergency = True
+        self._wishes.append(Wish.EMERGENCY)
         if self._stop_now is not None:
             self._stop_now()
 
     def take(self) -> Wish:
-        """Return what was asked since the last call; the loop calls this."""
-        if self._wish is Wish.NONE:
-            return Wish.NONE
-        with self._lock:
-            wish, self._wish = self._wish, Wish.NONE
-        return wish
-
-    def _ask(self, wish: Wish) -> None:
-        order = list(Wish)
-        with self._lock:
-            ending = self._wish in (Wish.STOP, Wish.EMERGENCY)
-            if not ending or order.index(wish) > order.index(self._wish):
-                self._wish = wish
+        """Return what was asked since the last call, the gravest stop or else the last word; the loop calls this."""
+        asked = [self._wishes.popleft() for _ in range(len(self._wishes))]
+        stops = (wish for wish in (Wish.EMERGENCY, Wish.STOP) if wish in asked)
+        return next(stops, asked[-1] if asked else Wish.NONE)

@@ -170,14 +170,14 @@ class ReplayedControls(Controls):
         super().__init__()
         self._now = now
         self._sample = sample
-        self._wishes = [
+        self._asked_then = [
             (int(row["sample"]), Wish(row["text"].decode())) for row in recording.events if row["kind"] == b"operator"
         ]
 
     def take(self) -> Wish:
         """Return what was asked at this frame then, or what is asked now."""
-        if self._wishes and self._wishes[0][0] <= self._sample():
-            return self._wishes.pop(0)[1]
+        if self._asked_then and self._asked_then[0][0] <= self._sample():
+            return self._asked_then.pop(0)[1]
         return Wish.NONE if self._now is None else self._now.take()
 
 

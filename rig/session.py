@@ -20,11 +20,11 @@ from drivers.errors import DeviceError
 from rig.bench import Bench
 from rig.check import check, parking
 from rig.commanded import CommandedPump, CommandedStage
-from rig.errors import FileError, Interlock, Refused, RigError
+from rig.errors import FileError, Interlock, Refused, RigError, StoppedByOperator
 from rig.instruments import Opened, open_instruments
 from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
-from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan
+from rig.observe import Controls, Ending, Observer, RunInfo, StepPlan, Wish
 from rig.protocols import apparatus_of, build_steps
 from rig.recorder import Recorder, insist_on_new
 from rig.recovery import recover
@@ -139,8 +139,7 @@ def _leave(opened: Opened, ending: Ending | None = None) -> None:
 
 def _recorded(request: Request, opened: Opened) -> Ending:
     reporter = Reporter([*request.observers, *opened.observers])
-    stage = CommandedStage(opened.stage, lambda text: reporter.event("command", text))
-    pump = None if opened.pump is None else CommandedPump(opened.pump, lambda text: reporter.event("command", text))
+    stage, pump = _commanded(request, opened, reporter)
     apparatus = apparatus_of(request.bench, stage, pump, reporter)
     steps = build_steps(request.scene, apparatus, request.hands)
     info = _info(request, opened, steps)
@@ -166,6 +165,20 @@ def _recorded(request: Request, opened: Opened) -> Ending:
     reporter.store = None  # closed
     reporter.notify("finished", ending)
     return ending
+
+
+def _commanded(request: Request, opened: Opened, reporter: Reporter) -> tuple[CommandedStage, CommandedPump | None]:
+    """Return stage and pump as the steps command them: every command is logged, none follows an emergency stop."""
+
+    def log(text: str) -> None:
+        reporter.event("command", text)
+
+    def insist() -> None:
+        if request.controls.emergency:
+            raise StoppedByOperator(f"{Wish.EMERGENCY.value} by the operator in step {reporter.step}")
+
+    pump = None if opened.pump is None else CommandedPump(opened.pump, log, insist)
+    return CommandedStage(opened.stage, log, insist), pump
 
 
 def _timing(loop: Loop, *, virtual: bool) -> str:
@@ -259,8 +272,9 @@ def _make_ready(request: Request, opened: Opened) -> None:
 def reference_stage(request: Request, opened: Opened) -> None:
     """Run the reference sequence under the force interlock, without a recording."""
     reporter = Reporter(opened.observers)
-    apparatus = apparatus_of(request.bench, opened.stage, None, reporter)
-    instruments = Instruments(opened.stage, None, opened.daq, opened.clock)
+    stage, _ = _commanded(request, opened, reporter)
+    apparatus = apparatus_of(request.bench, stage, None, reporter)
+    instruments = Instruments(stage, None, opened.daq, opened.clock)
     steps = reference(apparatus, parking(request.bench))
     try:
         _loop(request, opened, instruments, reporter, None).run(play(steps, reporter))

@@ -47,7 +47,7 @@ class Faults:
     """The script being played; safe to ask from any thread."""
 
     def __init__(self, script: Iterable[Fault] = ()) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a signal handler may stop the stage while its own thread is in here
         self._sample = 0
         self._starts: list[tuple[int, Fault]] = []
         self._waiting: list[Fault] = []

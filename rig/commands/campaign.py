@@ -100,20 +100,24 @@ def _run_all(
             pool.submit(_run_one, test, bench, bench_text, journal.free_name(test.key), arguments.direct): test
             for test in tests
         }
-        for future in as_completed(futures):
-            try:
-                outcome = future.result()
-            except BrokenProcessPool as error:
-                raise RigError(
-                    "campaign: a process was killed, and with it the tests under way. Remedy: the same command goes on "
-                    "where it stopped; with fewer --jobs if memory has run out."
-                ) from error
-            yield _enter(journal, futures[future], *outcome)
+        try:
+            for future in as_completed(futures):
+                try:
+                    outcome = future.result()
+                except BrokenProcessPool as error:
+                    raise RigError(
+                        "campaign: a process was killed, and with it the tests under way. Remedy: the same command "
+                        "goes on where it stopped; with fewer --jobs if memory has run out."
+                    ) from error
+                yield _enter(journal, futures[future], *outcome)
+        finally:
+            pool.shutdown(cancel_futures=True)  # after a failure or Ctrl-C no further test is begun
 
 
 def _run_one(
     test: PlannedTest, bench: Bench, bench_text: str, out: Path, direct: bool, keyboard: Keyboard | None = None
-) -> tuple[str, int, str]:
+) -> tuple[str, int, str, bool]:
+    """Run a test; return its recording's name, how it has ended, and whether no other is to follow."""
     from rig.session import Request, run_scene
 
     request = Request(
@@ -131,7 +135,7 @@ def _run_one(
     )
     request.observers = _observers(request, keyboard)
     ending = run_scene(request)
-    return out.name, ending.exit_code, ending.reason
+    return out.name, ending.exit_code, ending.reason, request.controls.ending
 
 
 def _observers(request: Request, keyboard: Keyboard | None) -> list[Observer]:
@@ -146,14 +150,18 @@ def _observers(request: Request, keyboard: Keyboard | None) -> list[Observer]:
     return [Terminal(voice), Prompts(keyboard, request.controls, voice)]
 
 
-def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reason: str) -> int:
-    """Enter a test that has succeeded; say why one has not."""
+def _enter(journal: Journal, test: PlannedTest, recording: str, code: int, reason: str, stopped: bool) -> int:
+    """Enter a test that has succeeded; say why one has not, or that the operator stopped when it was all but over."""
+    from rig.errors import StoppedByOperator
     from rig.voice import say
 
     if code:
         say(f"rig campaign: {test.key}: {reason}")
     else:
         journal.write(test.key, recording, scene=test.digest)
+        if stopped:
+            say(f"rig campaign: stopped by the operator after {test.key}")
+            return StoppedByOperator.exit_code
     return code
 
 

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the endpoints as one line of JSON, then serve."""
     import signal
-    import threading
+    import time
 
     from drivers.emulated.bench import EmulatedBench
     from rig.errors import FileError
@@ -36,9 +36,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not 0 < arguments.speed <= 1000:
         raise FileError(f"--speed {arguments.speed:g}: must be above 0 and at most 1000. Remedy: e.g. --speed 1.")
-    ended = threading.Event()
+    ended: list[int] = []  # not an event: the handler may run while this thread holds its lock
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+        signal.signal(number, lambda number, _: ended.append(number))
     faults = None if arguments.faults is None else load_faults(arguments.faults)
     bench = EmulatedBench(
         _truth(arguments.scene, arguments.seed),
@@ -49,8 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     with bench:
         print(json.dumps(_endpoints(bench, arguments.pty)), flush=True)
-        while not ended.wait(0.5):
-            pass  # a bounded wait lets Windows deliver Ctrl-C
+        while not ended:
+            time.sleep(0.1)
     return 0
 
 

@@ -40,10 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
         from rig.commands import console
 
         return console.run_with_console(arguments)
+    from rig.errors import StoppedByOperator
     from rig.operator import Keyboard
 
-    keyboard, place = Keyboard(), ""
+    keyboard, place, ending_asked = Keyboard(), "", False
     for test, request in _requests(arguments):
+        if ending_asked:
+            raise StoppedByOperator(f"stopped by the operator before {test.key}")
         if test.place != place and not request.bench.is_emulated:
             if arguments.link:  # a console cannot attach before the run
                 request.hands = test.prompt.rstrip(".")
@@ -53,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         ending = _run_once(request, arguments, keyboard)
         if ending.exit_code:
             return ending.exit_code
+        ending_asked = request.controls.ending  # when the test was all but over
     return 0
 
 
