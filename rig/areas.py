@@ -11,6 +11,7 @@ from pathlib import Path
 from analysis.quantity import Quantity
 from analysis.run import Run
 from rig.errors import FileError
+from rig.library import read_text
 
 SETTINGS = {
     "area_mm2": "contact_area_mm2",
@@ -40,10 +41,8 @@ def read_areas(path: Path) -> Areas:
     FileError
         Names the file, the line and the cell that is not an area.
     """
-    try:
-        lines = csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines(), skipinitialspace=True)
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"{path}: {error}. Remedy: name a CSV file as written by rig contact-area") from error
+    text = read_text("areas", path, ", or write one with rig contact-area")
+    lines = csv.DictReader(text.splitlines(), skipinitialspace=True)
     columns = [(name or "").strip() for name in lines.fieldnames or ()]
     lines.fieldnames = columns
     unknown = [name for name in columns if name not in SETTINGS and name != "recording"]
@@ -105,7 +104,7 @@ def add_area(path: Path, recording: str, area: Quantity) -> None:
         The file has other columns, or cannot be written.
     """
     try:
-        before = path.read_text(encoding="utf-8-sig") if path.exists() else HEADER + "\n"
+        before = read_text("areas", path) if path.exists() else HEADER + "\n"
         if before.partition("\n")[0].strip() != HEADER:
             raise FileError(f"{path}: has other columns than {HEADER}. Remedy: another file, or add the line by hand")
         end = "" if before.endswith("\n") else "\n"

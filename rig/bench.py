@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 from pydantic import Field
 
@@ -220,6 +221,20 @@ class Bench(Section):
                 f'connection = "{EMULATED}" of {names[True]}, but not of {names[False]}: the emulated ones share one '
                 "world; emulate all or none"
             )
+        return self
+
+    @rule
+    def _can_be_reached(self) -> Bench:
+        for name, part in (("stage", self.stage), ("pump", self.pump), ("daq", self.daq)):
+            if part is None or "://" not in part.connection:
+                continue
+            address = part.connection.partition("://")[2].partition(" ")[0]
+            try:
+                parts = urlsplit(f"//{address}")
+                (parts.hostname or "").encode("idna")
+                _ = parts.port
+            except ValueError as error:
+                raise ValueError(f"{name}.connection = {part.connection!r} is no address: {error}") from error
         return self
 
     @rule

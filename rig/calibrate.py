@@ -87,11 +87,11 @@ def dead_weights(recording: Recording) -> Calibration:
 compression_positive = {str(fit.slope > 0).lower()}
 
 [force.calibration]                # replace the whole table; check what is marked
-id = "{force.cell}-{day}"
-certificate = "{recording.path.name}"
+id = {_quoted(f"{force.cell}-{day}")}
+certificate = {_quoted(recording.path.name)}
 date = {day}
-operator = "{present.operator}"  # check: who hung the weights
-serial = "{present.serial}"  # check: on the load cell
+operator = {_quoted(present.operator)}  # check: who hung the weights
+serial = {_quoted(present.serial)}  # check: on the load cell
 slope = {abs(fit.slope):.8g}  # N per {unit}
 intercept = {sign * fit.intercept:.6g}  # N at 0 {unit}
 relative_uncertainty = {fit.relative_uncertainty:.3g}  # standard, from fit and masses
@@ -279,6 +279,13 @@ def _picture(
     from analysis.figures.fit_picture import FitPicture
 
     return FitPicture(recording.scene.title, result, *data, *labels, residual_scale=scale, joined=joined)
+
+
+def _quoted(text: str) -> str:
+    """Return a text as it is written in a TOML file."""
+    import tomlkit
+
+    return tomlkit.item(text).as_string()
 
 
 def _section(recording: Recording, kind: type[SectionType]) -> SectionType:

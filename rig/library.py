@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -13,6 +14,9 @@ Kind = Literal["scene", "bench", "campaign"]
 
 FOLDERS: dict[Kind, str] = {"scene": "scenes", "bench": "benches", "campaign": "campaigns"}
 """Packages that hold what ships."""
+
+LARGEST_BYTES = 1 << 20
+"""Of a text file: a thousand times what the longest scene needs."""
 
 
 def shipped(kind: Kind) -> list[str]:
@@ -49,15 +53,20 @@ def load_scene(name: str | Path) -> tuple[Scene, str]:
 
 
 def read_text(kind: str, path: Path, otherwise: str = "") -> str:
-    """Read a small UTF-8 text file; ``otherwise`` ends the remedy where there is none.
+    """Read a small UTF-8 text file, with or without a byte order mark; ``otherwise`` ends the remedy if it is missing.
 
     Raises
     ------
     FileError
-        It does not exist, or cannot be read.
+        It does not exist, cannot be read, is no ordinary file, or far too long.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise FileError(f"{kind} {path}: is no ordinary file. Remedy: it must be a UTF-8 text file.")
+        if status.st_size > LARGEST_BYTES:
+            raise FileError(f"{kind} {path}: has {status.st_size} bytes. Remedy: at most {LARGEST_BYTES} are read.")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise FileError(f"{kind} {path}: no such file. Remedy: check the path{otherwise}.") from error
     except (OSError, ValueError) as error:  # a path may hold what no path can

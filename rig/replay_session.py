@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from drivers.errors import DeviceError
 from model.parameters import Parameters
 from rig.commanded import CommandedPump, CommandedStage
-from rig.errors import RigError
+from rig.errors import FileError, RigError
 from rig.instruments import sensor_converter
 from rig.interlocks import Interlocks, limits_of
 from rig.loop import Instruments, Loop, Reporter
@@ -134,6 +134,8 @@ def what_if(recording: Recording, model: str | None, changes: Sequence[str]) -> 
         table = content
         for part in tables or [_table_of(recording.scene, name)]:
             table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                raise FileError(f"{change}: {part} of the scene is no table. Remedy: name a key of the scene file.")
         try:
             table[name] = float(value)
         except ValueError:

@@ -90,7 +90,7 @@ def parsed(schema: type[Schema], kind: str, text: str, source: str, *, recorded:
     """
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, brackets thousands deep
         raise FileError(f"{kind} {source}: not valid TOML: {error}. Remedy: mend the line it names.") from error
     return validated(schema, kind, content, source, recorded=recorded)
 

@@ -183,6 +183,16 @@ def test_the_lines_of_the_load_cell_go_into_the_bench_file(run):
     assert abs(new["intercept"] - old["intercept"]) < 2e-3
 
 
+def test_names_in_quotes_stay_what_they_are_in_the_lines_of_the_load_cell(run):
+    _, text = load_bench(None)
+    name = 'Ann "Bee" O\\N'
+    head, _, rest = text.partition("operator = ")
+    bench = f"{head}operator = {json.dumps(name)}\n{rest.partition(chr(10))[2]}"
+    path = run("dead-weights", rest_s=0.5, bench=(parse_bench(bench, "new.toml"), bench))
+    toml = calibrate(load_recording(path)).toml
+    assert tomllib.loads(toml)["force"]["calibration"]["operator"] == name
+
+
 def test_the_pressure_zero_goes_into_the_bench_file_and_takes_effect(run):
     first = calibrate(load_recording(run("pressure-zero")))
     _, text = load_bench(None)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from rig.campaign import load_campaign
 from rig.check import check
 from rig.cli import main
 from rig.errors import FileError, Refused
-from rig.library import find, load_scene, shipped
+from rig.library import LARGEST_BYTES, find, load_scene, shipped
 from rig.scene import parse_scene
 
 SPHERE = '[substrate]\nshape = "sphere"\ndiameter_mm = 60.0\n'
@@ -34,6 +36,9 @@ SPHERE = '[substrate]\nshape = "sphere"\ndiameter_mm = 60.0\n'
         (SPHERE + "[membrane]\nthickness_um = 0\n", ["thickness_um"]),
         ("shape = ", ["TOML"]),
         ("", ["substrate"]),
+        ("title = " + "9" * 5000, ["TOML", "Remedy"]),
+        ("title = " + "[" * 5000, ["TOML", "Remedy"]),
+        ("title = " + "{ a = " * 3000, ["TOML", "Remedy"]),
     ],
 )
 def test_a_bad_scene_names_file_key_value_and_remedy(text, words):
@@ -67,6 +72,39 @@ def test_a_file_or_the_name_of_one_that_ships(load, kind, one, tmp_path, monkeyp
             assert words in str(caught.value)
     with pytest.raises(FileError, match=f"{kind} .*own.*cannot be read"):
         load(Path("own\0.toml"))
+
+
+def test_a_file_from_a_windows_editor_may_begin_with_a_byte_order_mark(tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text(find("scene", "sphere-60mm-low")[0], encoding="utf-8-sig", newline="\r\n")
+    assert load_scene(file)[0] == load_scene("sphere-60mm-low")[0]
+
+
+def test_what_is_no_ordinary_file_is_refused_without_waiting_for_its_end(tmp_path):
+    with pytest.raises(FileError, match="no ordinary file"):
+        load_scene(tmp_path)
+    if sys.platform != "win32":
+        os.mkfifo(tmp_path / "pipe.toml")
+        for endless in (tmp_path / "pipe.toml", Path("/dev/zero")):
+            with pytest.raises(FileError, match="no ordinary file"):
+                load_scene(endless)
+    long = tmp_path / "long.toml"
+    long.write_bytes(b"#" * (LARGEST_BYTES + 1))
+    with pytest.raises(FileError, match=f"at most {LARGEST_BYTES}"):
+        load_scene(long)
+
+
+@pytest.mark.parametrize(
+    "address", ["socket://127.0.0.1:99999", "socket://[::1", f"socket://{'a' * 80}.de:1", "grpc://127.0.0.1:99999"]
+)
+def test_a_connection_that_is_no_address_is_refused(address):
+    text, _ = find("bench", "emulated")
+    part = "daq" if address.startswith("grpc") else "stage"
+    for name, connection in ({"stage": "COM1", "pump": "COM2", "daq": "local"} | {part: address}).items():
+        text = text.replace(f'[{name}]\nconnection = "emulated"', f'[{name}]\nconnection = "{connection}"')
+    with pytest.raises(FileError) as caught:
+        parse_bench(text, "b.toml")
+    assert f"{part}.connection = '{address}' is no address" in str(caught.value)
 
 
 @pytest.mark.parametrize(
