@@ -13,6 +13,7 @@ from drivers.emulated.direct import DirectDaq
 from drivers.emulated.faults import Fault, Faults
 from drivers.errors import NotConnected
 from rig.bench import parse_bench
+from rig.cli import main
 from rig.emulation import truth
 from rig.errors import FileError, Refused
 from rig.measured import load_run
@@ -95,6 +96,18 @@ def test_replay_sees_a_changed_bit(request_for):
     with h5py.File(request.out, "r+") as file:
         file["entry/data/force"][1234] += 1e-12
     assert replay(load_recording(request.out), pace=Pace()).differences
+
+
+@pytest.mark.parametrize(
+    "change", ["title.x=1", "membrane.thickness=1", "protocol.speed.x=1", "thickness_um=thin", "=1"]
+)
+def test_a_replay_with_a_value_that_is_none_of_the_scene_is_refused(change, request_for, capsys):
+    request = request_for()
+    run_scene(request)
+    assert main(["replay", str(request.out), "--set", change]) == 2
+    told = capsys.readouterr().err
+    assert "Traceback" not in told
+    assert change in told
 
 
 class StopIn(Observer):
