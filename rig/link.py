@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection
+from typing import Any
 
 from rig.link_address import Address, LinkError, forget
 from rig.link_proof import READY, TEXT_BYTES, hang_up, prove, receive
@@ -38,6 +39,50 @@ class Answer:
     delay_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Which command on its connection, and when it was sent (``time.monotonic``)."""
+
+    number: int
+    sent: float
+
+
+class _Asking:
+    """A connection for commands; safe from any thread.
+
+    Answers come in the order of the commands, those that nobody waits for any more included, so they are counted.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self._sending, self._receiving = threading.Lock(), threading.Lock()
+        self._asked = self._answered = 0
+        self._answers: dict[int, Any] = {}
+
+    def ask(self, command: str) -> Asked:
+        """Put a command on the wire; it never waits for an answer to another."""
+        with self._sending:
+            self._asked += 1
+            with contextlib.suppress(OSError):  # hung up: ``answer`` says so
+                self.connection.send_bytes(command.encode())
+            return Asked(self._asked, time.monotonic())
+
+    def answer(self, asked: Asked, limit: float) -> Answer | None:
+        """Wait for the answer to a command in the kernel: a busy interpreter cannot make a prompt one look late."""
+        try:
+            with self._receiving:
+                deadline = time.monotonic() + limit
+                while self._answered < asked.number:
+                    if not self.connection.poll(max(0.0, deadline - time.monotonic())):
+                        return None
+                    self._answered += 1
+                    self._answers[self._answered] = json.loads(self.connection.recv_bytes(TEXT_BYTES))
+                reply = self._answers.pop(asked.number)
+        except (EOFError, OSError):
+            return Answer(False, "the run is over", time.monotonic() - asked.sent)
+        return Answer(bool(reply["done"]), str(reply["text"]), time.monotonic() - asked.sent)
+
+
 class Link:
     """A console's attachment to one run.
 
@@ -55,9 +100,8 @@ class Link:
         self._who = secrets.token_hex(8)
         self._inbox: deque[Message] = deque()
         self._watch = self._open("watch")
-        self._command = self._open("command")
-        self._emergency = self._open("emergency")
-        self._one_command = threading.Lock()
+        self._command = _Asking(self._open("command"))
+        self._emergency = _Asking(self._open("emergency"))
         self._over = threading.Event()
         self.killed = False
         """Whether this console had to kill the run."""
@@ -106,25 +150,19 @@ class Link:
 
         A ``stop`` without an answer within ``ACKNOWLEDGE_S`` kills the run.
         """
-        with self._one_command:
-            limit = ACKNOWLEDGE_S if command == "stop" else within_s
-            answer = self._exchange(self._command, command, limit)
+        limit = ACKNOWLEDGE_S if command == "stop" else within_s
+        answer = self._command.answer(self._command.ask(command), limit)
         if answer is None and command == "stop":
             return self._kill("stop")
         return answer or Answer(False, "the run did not answer; the emergency stop still works", limit)
 
-    def send_emergency_stop(self) -> float:
-        """Put the emergency stop on the wire from the calling thread; return when that was (``time.monotonic``)."""
-        try:
-            self._emergency.send_bytes(b"emergency stop")
-        except OSError:
-            return time.monotonic()  # hung up: there is nothing left to stop
-        return time.monotonic()
+    def send_emergency_stop(self) -> Asked:
+        """Put the emergency stop on the wire from the calling thread."""
+        return self._emergency.ask("emergency stop")
 
-    def confirm_emergency_stop(self, sent: float) -> Answer:
+    def confirm_emergency_stop(self, asked: Asked) -> Answer:
         """Wait for the acknowledgement of ``send_emergency_stop``; kill the run when it does not come in time."""
-        answer = self._answer(self._emergency, sent, ACKNOWLEDGE_S)
-        return answer or self._kill("emergency stop")
+        return self._emergency.answer(asked, ACKNOWLEDGE_S) or self._kill("emergency stop")
 
     def emergency_stop(self) -> Answer:
         """Send the emergency stop and wait for its acknowledgement."""
@@ -132,29 +170,12 @@ class Link:
 
     def close(self) -> None:
         """Detach; the run goes on."""
-        for connection in (self._watch, self._command, self._emergency):
+        connections = (self._watch, self._command.connection, self._emergency.connection)
+        for connection in connections:
             hang_up(connection)
         self._over.wait(1.0)
-        for connection in (self._watch, self._command, self._emergency):
+        for connection in connections:
             connection.close()
-
-    def _exchange(self, connection: Connection, command: str, limit: float) -> Answer | None:
-        sent = time.monotonic()
-        try:
-            connection.send_bytes(command.encode())
-        except OSError:
-            return Answer(False, "the run is over", 0.0)
-        return self._answer(connection, sent, limit)
-
-    def _answer(self, connection: Connection, sent: float, limit: float) -> Answer | None:
-        """Wait in the kernel, so that a busy interpreter cannot make a prompt answer look late."""
-        try:
-            if not connection.poll(limit):
-                return None
-            reply = json.loads(connection.recv_bytes(TEXT_BYTES))
-        except (EOFError, OSError):
-            return Answer(False, "the run is over", time.monotonic() - sent)
-        return Answer(bool(reply["done"]), str(reply["text"]), time.monotonic() - sent)
 
     def _kill(self, what: str) -> Answer:
         """End the run's process: it is alive (the connection stands) but silent. The dead man stops the rest."""

@@ -120,5 +120,6 @@ def publish(address: Address) -> Path:
 
 
 def forget(address: Address) -> None:
-    """Remove the file of a run that died without doing so itself."""
-    address_file(address.name).unlink(missing_ok=True)
+    """Remove the file of a run that died without doing so itself; a run that has taken its name keeps its own."""
+    if find(address.name) == address:
+        address_file(address.name).unlink(missing_ok=True)

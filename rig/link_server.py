@@ -131,8 +131,9 @@ class LinkServer(Observer):
     def frame(self, frame: Frame) -> None:
         """Queue a frame; drop the oldest when the queue is full."""
         if len(self._inbox) >= INBOX_FRAMES:
-            self._inbox.popleft()
-            self.dropped += 1
+            with contextlib.suppress(IndexError):  # the packer may have taken all of them meanwhile
+                self._inbox.popleft()
+                self.dropped += 1
         self._put(frame)
 
     def step(self, event: StepEvent) -> None:

@@ -83,14 +83,17 @@ def _rewritten(path: Path, *, force: bool) -> Recovery | None:
                 extend(sets[name], block)
         samples, frames = complete(file["entry"])
         _end(file["entry"], samples)
-    journal.unlink()
+    journal.unlink(missing_ok=True)
     return Recovery(path, samples, frames, repaired=True)
 
 
 @contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
-    """Give the name of a new file; once written it is sealed, forced to the disk, and takes the old one's place."""
-    fresh = path.with_name(f".{path.name}.recovering")
+    """Give the name of a new file; once written it is sealed, forced to the disk, and takes the old one's place.
+
+    Two programs may repair one recording at the same time: each writes a file of its own.
+    """
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.recovering")
     fresh.unlink(missing_ok=True)
     try:
         yield fresh

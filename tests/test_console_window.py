@@ -28,7 +28,7 @@ from rig.console.runner import Child, replay_arguments, run_arguments
 from rig.console.theme import THEMES
 from rig.console.window import Console
 from rig.library import find, shipped
-from rig.link import Link
+from rig.link import Answer, Link
 from rig.link_address import DIRECTORY_VARIABLE
 from rig.link_server import LinkServer
 from rig.observe import Controls, Event, Wish
@@ -234,6 +234,56 @@ def test_the_emergency_stop_leaves_before_anything_is_painted(
     monkeypatch.setattr(console, "_show", lambda *_: order.append("painted"))
     qtbot.keyPress(console, Qt.Key.Key_Escape)
     assert order[0] == "sent"
+
+
+def test_a_stop_asked_for_just_before_the_window_closes_is_sent(
+    console: Console, qtbot: QtBot, publish: Callable[..., Published], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    published = publish(speed=2.0)
+    attach(console, qtbot)
+    assert console.link is not None
+    command = console.link.command
+
+    def slow(words: str) -> Answer:
+        time.sleep(0.3 if words == "hold" else 0.0)
+        return command(words)
+
+    monkeypatch.setattr(console.link, "command", slow)
+    console.hold()
+    console.stop()
+    console.close()
+    qtbot.waitUntil(lambda: published.ended is Wish.STOP, timeout=WAIT_MS)
+
+
+def test_an_emergency_stop_is_waited_for_by_a_window_that_closes(
+    console: Console, qtbot: QtBot, publish: Callable[..., Published], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run is killed if it does not answer: not even a closed window may call that off."""
+    publish(speed=2.0)
+    attach(console, qtbot)
+    link = console.link
+    assert link is not None
+    confirm, answers = link.confirm_emergency_stop, []
+
+    def slowly(asked: Any) -> Answer:
+        time.sleep(0.3)
+        answers.append(confirm(asked))
+        return answers[-1]
+
+    monkeypatch.setattr(link, "confirm_emergency_stop", slowly)
+    console.emergency_stop()
+    console.close()
+    assert [answer.done for answer in answers] == [True]
+
+
+def test_the_emergency_stop_ends_a_run_that_is_between_two_tests(console: Console, qtbot: QtBot) -> None:
+    """There is no link to ask it by: the next test must not begin all the same."""
+    waiting = Child(["-c", "import time; print('between', flush=True); time.sleep(600)"], command=[sys.executable])
+    qtbot.waitUntil(lambda: waiting.output() == "between", timeout=WAIT_MS)
+    console.start(waiting, replaying=False)
+    assert console.emergency.isEnabled()
+    qtbot.keyPress(console, Qt.Key.Key_Escape)
+    qtbot.waitUntil(lambda: not waiting.alive, timeout=WAIT_MS)
 
 
 def test_a_fault_is_said_in_full(console: Console, qtbot: QtBot, publish: Callable[..., Published]) -> None:

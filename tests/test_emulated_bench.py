@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 
 from drivers.emulated.bench import EmulatedBench
 from drivers.emulated.faults import Fault
+from drivers.emulated.server import Line
 from drivers.emulated.truth import Truth
 from rig.errors import FileError
 from rig.fault_script import known_faults, load_faults
@@ -258,3 +260,19 @@ def test_every_device_has_faults_with_a_meaning():
     known = known_faults()
     assert set(known) == {"stage", "pump", "daq", "force", "pressure", "supply"}
     assert all(meaning for kinds in known.values() for meaning in kinds.values())
+
+
+def test_nothing_is_written_on_a_line_that_has_been_closed():
+    """The number of a closed terminal may be another file's by then."""
+    writing, written = threading.Event(), []
+
+    def slow(data: bytes) -> None:
+        writing.set()
+        time.sleep(0.1)
+        written.append(data)
+
+    line = Line(slow)
+    line.send(b"late", 1e-3)
+    assert writing.wait(PATIENCE)
+    line.close()
+    assert written == [b"late"]

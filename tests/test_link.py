@@ -12,8 +12,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from multiprocessing.connection import Client
+from multiprocessing.connection import Client, Connection
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from drivers.errors import NotConnected
 from drivers.interfaces import PumpState, PumpStatus, StageStatus
 from rig import link_address as addresses
 from rig import link_server, wire
-from rig.link import Link
+from rig.link import Answer, Link
 from rig.link_address import Address, LinkError
 from rig.link_proof import receive_text
 from rig.link_server import LinkServer
@@ -371,7 +372,7 @@ def test_the_loops_queue_is_bounded_and_drops_the_oldest(monkeypatch: pytest.Mon
 
 CONSOLE = """
 import sys, time
-from rig.link import Link
+from rig.link import Answer, Link
 from rig.link_address import running
 link = Link(running()[0])
 link.command("claim")
@@ -403,6 +404,79 @@ def test_a_frozen_or_killed_console_takes_nothing_from_the_run(harm: signal.Sign
             healthy.close()
             server.close(drain_s=0.1)
             console.kill()
+
+
+def test_a_late_answer_is_not_taken_for_that_of_a_later_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    late, never = threading.Event(), threading.Event()
+
+    class Slow(Controls):
+        def hold(self) -> None:
+            late.wait()
+
+        def stop(self) -> None:
+            never.wait()
+
+    killed: list[str] = []
+    monkeypatch.setattr(Link, "_kill", lambda link, what: killed.append(what) or Answer(False, "killed", 0.2))
+    with LinkServer(Slow()) as server:
+        link = Link(server.address)
+        assert not link.command("hold", within_s=0.01).done
+        late.set()
+        time.sleep(0.2)  # the answer to the hold has come by now
+        assert not link.command("stop").done
+        assert killed == ["stop"]
+        never.set()
+        link.close()
+
+
+def test_two_emergency_stops_at_once_are_both_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
+    receive = Connection._recv  # type: ignore[attr-defined]
+
+    def slowly(connection: Connection, *arguments: Any) -> Any:
+        received = receive(connection, *arguments)
+        time.sleep(0.02)  # between the length of a message and its text
+        return received
+
+    pressed: list[str] = []
+    controls = Controls()
+    controls.connect(lambda: pressed.append("now"))
+    with LinkServer(controls) as server:
+        link = Link(server.address)
+        monkeypatch.setattr(Connection, "_recv", slowly)
+        answers: list[Answer] = []
+        asked = [link.send_emergency_stop(), link.send_emergency_stop()]
+        waiting = [
+            threading.Thread(target=lambda one=one: answers.append(link.confirm_emergency_stop(one)), daemon=True)
+            for one in reversed(asked)
+        ]
+        for thread in waiting:
+            thread.start()
+        for thread in waiting:
+            thread.join(20)
+        assert [answer.done for answer in answers] == [True, True]
+        assert pressed == ["now", "now"]
+        link.close()
+
+
+def test_a_frame_is_queued_although_the_packer_has_emptied_a_full_queue_meanwhile() -> None:
+    class Emptied(deque[Any]):
+        def __len__(self) -> int:
+            return link_server.INBOX_FRAMES
+
+    with LinkServer(Controls()) as server:
+        server._inbox = Emptied()
+        server.frame(frame(0))
+        assert server.dropped == 0
+        server._inbox = deque()
+
+
+def test_a_console_that_comes_too_late_does_not_hide_the_next_run_of_that_name() -> None:
+    with LinkServer(Controls(), name="console-1") as server:
+        over = server.address
+    with LinkServer(Controls(), name="console-1") as server:
+        with pytest.raises(LinkError, match="cannot be reached"):
+            Link(over)
+        assert addresses.find("console-1") == server.address
 
 
 RUN = """

@@ -15,11 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.errors import BeingWritten, FileError
+from rig.journal import journal_of
 from rig.layout import EVENTS, pieces
+from rig.library import find
 from rig.observe import Observer
 from rig.recorder import Recorder
 from rig.recording import load_recording, open_recording
 from rig.recovery import recover
+from rig.seal import seal
 from rig.session import run_scene
 
 
@@ -77,6 +80,31 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(tmp_path):
         assert file["entry/data/force"].shape[0] == recording.force.size == with_data
     assert np.array_equal(recording.volts.T, volts)
     assert recording.ending == ("the program died; recovered", -9)
+
+
+@pytest.mark.parametrize("journalled", [False, True])
+def test_two_programs_may_repair_one_recording_at_the_same_time(tmp_path, monkeypatch, journalled):
+    bench, _ = find("bench", "emulated")
+    (tmp_path / "bench.toml").write_text(
+        f"{bench}\n[recording]\nsurvives_power_cut = {str(journalled).lower()}\n", "utf-8"
+    )
+    path = tmp_path / "killed.h5"
+    words = ("run", "sphere-60mm-vented", "--bench", tmp_path / "bench.toml", "--direct", "--no-live", "--out", path)
+    with held(1, 200, *words) as writer:
+        writer.kill()
+    assert journal_of(path).exists() == journalled
+    whole = []
+
+    def the_other_is_done_first(fresh):
+        if not whole:
+            subprocess.run([sys.executable, "-m", "rig", "recover", str(path)], check=True)
+            whole.append(load_recording(path))
+        seal(fresh)
+
+    monkeypatch.setattr("rig.recovery.seal", the_other_is_done_first)
+    assert recover(path).repaired
+    assert np.array_equal(load_recording(path).force, whole[0].force)
+    assert {file.name for file in tmp_path.iterdir()} == {"bench.toml", "killed.h5"}
 
 
 @pytest.mark.parametrize("content", [b"", b"not hdf5", b"\x89HDF\r\n\x1a\n" + b"\0" * 100])

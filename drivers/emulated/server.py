@@ -89,9 +89,11 @@ class Line:
         self._waiting.put((time.monotonic() + delay, data))
 
     def close(self) -> None:
-        """Drop what is waiting."""
+        """Drop what is waiting; nothing is written afterwards, for another file may get the wire's number."""
         self._closed.set()
         self._waiting.put(None)
+        if self._thread is not None:
+            self._thread.join(LEAVING_PATIENCE)
 
     def _put(self, data: bytes) -> None:
         step = self._fragment or len(data)

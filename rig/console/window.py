@@ -388,16 +388,25 @@ class Console(QMainWindow):
     def emergency_stop(self) -> None:
         """Put the stop on the wire now, from this very call; a run that does not answer in time is killed."""
         link = self.link
-        if link is None or self._replaying:
+        if self._replaying:
             return
-        sent = link.send_emergency_stop()
+        if link is None:
+            self._end_child()
+            return
+        asked = link.send_emergency_stop()
 
         def confirm() -> None:
-            answer = link.confirm_emergency_stop(sent)
+            answer = link.confirm_emergency_stop(asked)
             self._answers.append(lambda: self._answered("emergency stop", answer, lambda: None))
 
         self._emergencies.submit(confirm)
         self._set_state("EMERGENCY STOP", "fault")
+
+    def _end_child(self) -> None:
+        """Let no further test begin: the run is starting or between two tests, and there is no link to ask it by."""
+        if self.child is not None and self.child.alive:
+            self.child.process.terminate()
+            self._set_state("EMERGENCY STOP", "fault")
 
     def _answered(self, command: str, answer: Answer, done: Callable[[], None]) -> None:
         if answer.done:
@@ -635,10 +644,10 @@ class Console(QMainWindow):
         """Detach. A run goes on; a replay ends with its console."""
         self._timer.stop()
         self._filter.remove()
+        for pool in (self._commands, self._emergencies):
+            pool.shutdown()  # a stop asked for last is still sent, and the run killed if it does not answer
         self._detach()
         self._end_replay()
-        self._commands.shutdown(wait=False, cancel_futures=True)
-        self._emergencies.shutdown(wait=True)
         event.accept()
 
 
