@@ -57,7 +57,19 @@ def check(scene: Scene, bench: Bench) -> None:
 
 def reasons(scene: Scene, bench: Bench) -> list[str]:
     """Return why the bench cannot carry out the scene, each with value, limit and remedy; empty if it can."""
-    parts = (_instruments, _forces, _resolution, _tension, _pressure, _strokes, _tare, _speeds, _overruns, _retraction)
+    parts = (
+        _instruments,
+        _forces,
+        _contact,
+        _resolution,
+        _tension,
+        _pressure,
+        _strokes,
+        _tare,
+        _speeds,
+        _overruns,
+        _retraction,
+    )
     return [reason for part in parts for reason in part(scene, bench)]
 
 
@@ -86,6 +98,17 @@ def _forces(scene: Scene, bench: Bench) -> list[str]:
     return [
         f"preload_N = {preload:g} comes too near the compression limit {limit:g} N "
         f"(at most {limit / STOPPING_MARGIN:.3g} N); lower the preload or fit a larger load cell"
+    ]
+
+
+def _contact(scene: Scene, bench: Bench) -> list[str]:
+    """The stage goes at full speed up to the contact force."""
+    protocol = scene.protocol
+    if not isinstance(protocol, ContactSection) or protocol.contact_force_mN <= protocol.preload_N / 2 * 1e3:
+        return []
+    return [
+        f"contact_force_mN = {protocol.contact_force_mN:g} is more than half of preload_N = {protocol.preload_N:g}: "
+        f"the approach would pass the preload; make it at most {protocol.preload_N / 2 * 1e3:g}"
     ]
 
 
@@ -216,12 +239,15 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
         ]
     limits, preload = bench.limits, protocol.preload_N
     reaction = reaction_s(bench)
+    key = (
+        "compression_N" if limits.compression_N >= limits.tension_N else "tension_N"
+    )  # compression_positive may be wrong
     found = _too_fast(
         "approach_speed_um_s",
         protocol.approach_speed_um_s,
         bench,
         {
-            "lower compression_N or shorten frame_ms": room_um(bench, limits.compression_N) / reaction,
+            f"lower {key} or shorten frame_ms": room_um(bench, getattr(limits, key)) / reaction,
             "lower preload_N or shorten lag_s": room_um(bench, preload) / (reaction + limits.lag_s),
         },
     )

@@ -120,6 +120,13 @@ class PullOff:
         last = frame
         try:
             while self._force(frame) < goal:
+                if self._force(frame) < -goal:
+                    raise StepFailed(
+                        "preload",
+                        f"the force has fallen to {self._force(frame):+.3f} N while the stage went down",
+                        "hang a weight on the gripper: the force must fall, or compression_positive is wrong; if it "
+                        "falls, the sample pulls harder than preload_N",
+                    )
                 if motion.arrived(frame):
                     raise StepFailed(
                         "preload",
