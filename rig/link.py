@@ -29,6 +29,9 @@ from rig.wire import BadMessage, Message, decode
 ACKNOWLEDGE_S = 0.2
 """A stop that is not acknowledged within this time makes the console kill the run."""
 
+OVER = "the run is over"
+"""The answer where the run has hung up: its next test, if it has one, did not hear the command."""
+
 
 @dataclass(frozen=True, slots=True)
 class Answer:
@@ -79,7 +82,7 @@ class _Asking:
                     self._answers[self._answered] = json.loads(self.connection.recv_bytes(TEXT_BYTES))
                 reply = self._answers.pop(asked.number)
         except (EOFError, OSError):
-            return Answer(False, "the run is over", time.monotonic() - asked.sent)
+            return Answer(False, OVER, time.monotonic() - asked.sent)
         return Answer(bool(reply["done"]), str(reply["text"]), time.monotonic() - asked.sent)
 
 

@@ -113,7 +113,7 @@ def publish(address: Address) -> Path:
     path = address_file(address.name)
     text = json.dumps({"host": address.host, "port": address.port, "key": address.key.hex(), "pid": address.pid})
     draft = path.with_suffix(".new")
-    with open(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="utf-8") as file:
+    with open(os.open(draft, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600), "w", encoding="utf-8") as file:
         file.write(text)
     draft.replace(path)
     return path

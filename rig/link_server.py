@@ -173,7 +173,8 @@ class LinkServer(Observer):
             self._log.changed.notify_all()
             while self._somebody_is_behind() and (left := deadline - time.monotonic()) > 0:
                 self._log.changed.wait(min(left, 0.05))
-        self._path.unlink(missing_ok=True)
+        with contextlib.suppress(PermissionError):  # on Windows, while a console reads it, which then forgets it
+            self._path.unlink(missing_ok=True)
         self._wake_acceptor()
         self._acceptor.join()
         with self._lock:

@@ -276,14 +276,40 @@ def test_an_emergency_stop_is_waited_for_by_a_window_that_closes(
     assert [answer.done for answer in answers] == [True]
 
 
-def test_the_emergency_stop_ends_a_run_that_is_between_two_tests(console: Console, qtbot: QtBot) -> None:
-    """There is no link to ask it by: the next test must not begin all the same."""
+@pytest.fixture
+def between(console: Console, qtbot: QtBot) -> Iterator[Child]:
+    """Start a run that is between two tests."""
     waiting = Child(["-c", "import time; print('between', flush=True); time.sleep(600)"], command=[sys.executable])
     qtbot.waitUntil(lambda: waiting.output() == "between", timeout=WAIT_MS)
     console.start(waiting, replaying=False)
+    yield waiting
+    waiting.process.kill()
+    waiting.process.wait()
+
+
+def test_the_emergency_stop_ends_a_run_that_is_between_two_tests(
+    console: Console, qtbot: QtBot, between: Child
+) -> None:
+    """There is no link to ask it by: the next test must not begin all the same."""
     assert console.emergency.isEnabled()
     qtbot.keyPress(console, Qt.Key.Key_Escape)
-    qtbot.waitUntil(lambda: not waiting.alive, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not between.alive, timeout=WAIT_MS)
+
+
+@pytest.mark.parametrize("key", [Qt.Key.Key_Escape, Qt.Key.Key_F8])
+def test_a_stop_that_comes_as_the_run_hangs_up_ends_it_before_its_next_test(
+    console: Console, qtbot: QtBot, publish: Callable[..., Published], between: Child, key: Qt.Key
+) -> None:
+    published = publish(speed=2.0)
+    attach(console, qtbot)
+    console._timer.stop()  # the window has not yet seen it
+    published.close()
+    qtbot.keyClick(console, key)
+    console._commands.submit(int).result()
+    qtbot.waitUntil(lambda: bool(console._answers), timeout=WAIT_MS)
+    assert between.alive
+    console.refresh()
+    qtbot.waitUntil(lambda: not between.alive, timeout=WAIT_MS)
 
 
 def test_a_fault_is_said_in_full(console: Console, qtbot: QtBot, publish: Callable[..., Published]) -> None:

@@ -479,6 +479,27 @@ def test_a_console_that_comes_too_late_does_not_hide_the_next_run_of_that_name()
         assert addresses.find("console-1") == server.address
 
 
+def test_what_a_killed_process_of_the_same_number_has_left_is_overwritten(runtime: Path) -> None:
+    runtime.mkdir(mode=0o700)
+    draft = runtime / f"run-{os.getpid()}.new"
+    draft.write_text("{", encoding="utf-8")
+    draft.chmod(0o600)
+    with LinkServer(Controls()) as server:
+        assert addresses.running() == [server.address]
+
+
+def test_a_console_that_is_just_reading_the_address_does_not_fail_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def held_open(path: Path, *, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "used by another process", str(path))
+
+    server = LinkServer(Controls())
+    link = Link(server.address)
+    monkeypatch.setattr(Path, "unlink", held_open)  # as on Windows
+    server.close()
+    wait_for(lambda: link.over, "the run hangs up")
+    link.close()
+
+
 RUN = """
 import sys, time
 from rig.link_server import LinkServer

@@ -45,7 +45,7 @@ from rig.console.theme import THEMES, Theme, style_sheet
 from rig.console.timing import durations, time_left, time_to_pull_off
 from rig.console.words import duration
 from rig.errors import RigError
-from rig.link import Answer, Link
+from rig.link import OVER, Answer, Link
 from rig.link_address import Address, LinkError, running
 from rig.observe import RunInfo
 
@@ -392,6 +392,7 @@ class Console(QMainWindow):
             return
         if link is None:
             self._end_child()
+            self._set_state("EMERGENCY STOP", "fault")
             return
         asked = link.send_emergency_stop()
 
@@ -406,9 +407,10 @@ class Console(QMainWindow):
         """Let no further test begin: the run is starting or between two tests, and there is no link to ask it by."""
         if self.child is not None and self.child.alive:
             self.child.process.terminate()
-            self._set_state("EMERGENCY STOP", "fault")
 
     def _answered(self, command: str, answer: Answer, done: Callable[[], None]) -> None:
+        if answer.text == OVER and command.endswith("stop"):
+            self._end_child()
         if answer.done:
             done()
             words = f"{command}: acknowledged after {answer.delay_s * 1e3:.1f} ms"
