@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import queue
 import sys
 import threading
@@ -16,11 +17,12 @@ from rig.voice import Voice
 class Keyboard:
     """Lines from standard input, read by one thread from the first question on.
 
-    An Enter answers the question asked last: of the program between runs, or of the run under way.
+    An Enter answers the question asked last: of the program between runs, or of the run under way. What was typed in a
+    terminal before it was asked answers nothing; a pipe's lines are answers prepared beforehand.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = sys.stdin if stream is None else stream
+        self._stream = stream or sys.stdin or io.StringIO()
         self._presses: queue.Queue[None] = queue.Queue()
         self._lock = threading.Lock()
         self._controls: Controls | None = None
@@ -36,6 +38,7 @@ class Keyboard:
         Refused
             Standard input is closed: nobody can answer.
         """
+        _forget_typed(self._stream)
         with self._lock:
             self._controls = None
             while not self._presses.empty():
@@ -52,6 +55,7 @@ class Keyboard:
 
         If nobody can, now or later, and the keyboard is ``alone`` in taking answers, the run is ended in good order.
         """
+        _forget_typed(self._stream)
         with self._lock:
             self._controls, self._alone = controls, alone
         self._read()
@@ -106,3 +110,20 @@ class Prompts(Observer):
             "nobody can answer, standard input is closed: the run ends. Remedy: run it in a terminal, or with --link"
         )
         self._voice.say(f"            {', or '.join(ways) or nobody}\n")
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _forget_typed(stream: TextIO) -> None:
+        """Throw away what waits in a terminal."""
+        while stream.isatty() and msvcrt.kbhit():
+            msvcrt.getwch()
+else:
+    import termios
+
+    def _forget_typed(stream: TextIO) -> None:
+        """Throw away what waits in a terminal."""
+        if stream.isatty():
+            with contextlib.suppress(termios.error):  # hung up; the reading thread tells
+                termios.tcflush(stream, termios.TCIFLUSH)

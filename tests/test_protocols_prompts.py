@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import os
+import queue
+import select
 import time
 
 import pytest
 from conftest import scene_text
+from links import TERMINALS
 
 from rig.bench import load_bench
 from rig.errors import Refused
@@ -82,6 +85,40 @@ def test_an_enter_pressed_before_the_question_does_not_answer_it(line):
         time.sleep(0.001)
     with pytest.raises(Refused, match="Nobody can answer"):
         keyboard.confirm("Mount the 60 mm sphere.")
+
+
+@TERMINALS
+def test_an_enter_typed_before_the_first_question_does_not_answer_it():
+    read = queue.Queue()
+
+    class Told(io.TextIOWrapper):
+        """A terminal that tells what is read from it."""
+
+        def __next__(self):
+            read.put(line := super().__next__())
+            return line
+
+    hand, terminal = os.openpty()
+    os.write(hand, b"too early\nand half a line")
+    select.select([terminal], [], [])
+    stream = Told(os.fdopen(terminal, "rb"))
+    keyboard, controls = Keyboard(stream), Controls()
+    try:
+        keyboard.answer_for(controls)
+        os.write(hand, b"in time\n")
+        assert read.get(timeout=60) == "in time\n"
+        assert taken(controls) is Wish.RESUME
+        keyboard.answer_for(controls)
+    finally:
+        os.close(hand)
+    assert taken(controls) is Wish.STOP
+    stream.close()
+
+
+def test_without_standard_input_nobody_can_answer(monkeypatch):
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(Refused, match="Nobody can answer"):
+        Keyboard().confirm("Mount the sphere.")
 
 
 def test_a_closed_keyboard_refuses_and_names_the_console(capsys, monkeypatch):
