@@ -73,7 +73,7 @@ class Extraction:
     zero_separation: float = field(init=False, default=math.nan)
     release: float = field(init=False, default=math.nan)
     release_separation: float = field(init=False, default=math.nan)
-    recoil: float = field(init=False, default=0.0)
+    release_uncertainty: float = field(init=False, default=0.0)
     peak: float = field(init=False, default=math.nan)
     peak_shift: float = field(init=False, default=math.nan)
 

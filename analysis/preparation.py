@@ -95,7 +95,8 @@ def tare(work: Extraction) -> Details:
        is the last crossing of three per cent of it.
     3. What the reading loses to creep of the load train is put back, as the bench's calibration says. Without one,
        creep is looked for in the dwell, and counts where the force comes back in the same way after detachment.
-    4. Block means before contact and after detachment, equally weighted, give level and drift by least squares.
+    4. Block means before contact and after detachment, equally weighted, give level and drift by least squares. What
+       fades to the last half of the record by more than five standard deviations of a 20 ms mean is left out.
     """
     run = work.run
     free_start, free_stop = work.windows.free
@@ -112,7 +113,7 @@ def tare(work: Extraction) -> Details:
     force = _without_creep(work, level, margin)
     if force is not run.force:
         work.detached = _rough_detachment(work, running_mean(force, width), level, noise.of_mean(width))
-    after = _after_detachment(work, margin)
+    after = _after_detachment(work, margin, _faded(work, running_mean(force, width), noise.of_mean(width)))
     windows = [before] if after is None else [before, after]
     work.baseline = fit_baseline(force, windows)
     work.force = force - work.baseline(np.arange(force.size, dtype=np.float64))
@@ -201,10 +202,20 @@ def _rough_detachment(work: Extraction, smooth: Array, level: float, sigma: floa
     return start + lowest + (int(tense[-1]) if tense.size else 0)
 
 
-def _after_detachment(work: Extraction, margin: int) -> tuple[int, int] | None:
+def _faded(work: Extraction, smooth: Array, sigma: float) -> int:
+    """Return how many samples after detachment tension still fades, half of what follows at most."""
+    if work.detached is None:
+        return 0
+    force = smooth[work.detached : work.windows.end]
+    half = force.size // 2
+    free = np.flatnonzero(force > float(np.median(force[half:])) - 5 * sigma)
+    return min(int(free[0]), half)
+
+
+def _after_detachment(work: Extraction, margin: int, faded: int = 0) -> tuple[int, int] | None:
     if work.detached is None:
         return None
-    start = work.detached + max(margin, (work.windows.end - work.detached) // 20)
+    start = work.detached + faded + max(margin, (work.windows.end - work.detached) // 20)
     return (start, work.windows.end) if work.windows.end - start >= margin else None
 
 

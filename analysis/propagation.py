@@ -203,7 +203,7 @@ def _sampling(work: Extraction) -> dict[str, float]:
     if "pull_off_distance_m" in values:
         travel = _speed(work, work.release) / np.sqrt(12.0)
         stage = np.hypot(_stage_noise(work, work.release), _stage_noise(work, work.zero))
-        found["pull_off_distance_m"] = float(np.sqrt(travel**2 + work.recoil**2 + stage**2))
+        found["pull_off_distance_m"] = float(np.sqrt(travel**2 + work.release_uncertainty**2 + stage**2))
     if "pull_off_force_N" in values:
         found["pull_off_force_N"] = values["sampling_bias_N"]
         found["retraction_at_pull_off_m"] = _speed(work, work.peak) * float(np.hypot(work.peak_shift, 12.0**-0.5))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -120,12 +121,11 @@ def detachment(work: Extraction) -> Details:
        the train springs back only when the contact is lost. Contacts run away before that: within the sample that is
        not seen the force is taken to fall by twice as much as in the one before, and by that much uncertain. A JKR
        contact loses its force with its area: what would be left counts the less, the more the fall grows.
-    3. Without such a jump: where the tension falls below four standard deviations of a 20 ms mean.
+    3. Without such a jump, or where tension is left after it: where that falls below four standard deviations of a
+       20 ms mean and of the creep put back. The mean comes late by half its width, and below that limit the tension
+       may go on: by as far again as it took to fall there from the limit of a single sample, if it fades no slower
+       than the square of the distance left. Both are half-widths of rectangular distributions.
     """
-    start, _ = work.retraction()
-    width = work.samples(SMOOTHING, least=4)
-    noise = work.noise.of_mean(width)
-    smooth = running_mean(work.force[start : work.windows.end], width)
     if work.detached is None:
         raise FeatureMissing("still attached at the end of the recording")
     tail = float(np.median(work.force[work.detached + (work.windows.end - work.detached) // 2 :]))
@@ -133,20 +133,44 @@ def detachment(work: Extraction) -> Details:
     if releases:
         jump = releases[-1]
         last = _last_tense(work, jump)
-        work.release = last + 0.5
-        held, uncertain = _held(work, last)
-        work.recoil = work.run.sensors.compliance * uncertain
+        fade = _fade(work, last + work.samples(SMOOTHING, least=4) // 2 + 1)
         work.set(snap_force_N=-jump.before, snap_duration_s=(jump.stop - jump.start) / work.run.rate)
         decision = f"jump of {jump.size * 1e3:.1f} mN within {(jump.stop - jump.start) / work.run.rate * 1e3:.3g} ms"
     else:
-        tense = np.flatnonzero(smooth[: work.detached + 2 * width - start] < -4 * noise)
-        work.release = float(start + (tense[-1] if tense.size else 0))
-        held = float(smooth[int(work.release) - start])
+        last, fade = work.detached, _fade(work, work.detached)
         work.missing.update(dict.fromkeys(("snap_force_N", "snap_duration_s"), "the tension fades without a jump"))
-        decision = "the tension fades into the noise"
+        decision = ""
+    if releases and fade is None:
+        work.release = last + 0.5
+        held, uncertain = _held(work, last)
+        work.release_uncertainty = work.run.sensors.compliance * uncertain
+    else:
+        faint, end = fade or (last, last)
+        held, work.release = float(work.force[end]), float(end)
+        unseen = end - faint, work.samples(SMOOTHING) / 2
+        work.release_uncertainty = math.hypot(*unseen) * _slope(work.run.height, end, work.samples(0.1)) / RECTANGULAR
+        decision += (", then " if decision else "") + "the tension fades into the noise"
     work.release_separation = work.at(work.run.height, work.release) + work.run.sensors.compliance * held
     work.set(pull_off_distance_m=work.release_separation - work.zero_separation)
     return {"decision": decision, "index": work.release}
+
+
+def _fade(work: Extraction, begin: int) -> tuple[int, int] | None:
+    """Return where 20 ms means no longer reach what single samples, and what means show; ``None``: no tension is left.
+
+    Noise does not end a fade before it has made a mean positive.
+    """
+    width = work.samples(SMOOTHING, least=4)
+    single, mean = work.noise.sigma, work.noise.of_mean(width)
+    creep = 0.0 if work.creep is None else work.creep.uncertainty * work.creep.response[begin:]
+    limit = -4 * np.hypot(mean, creep)
+    smooth = running_mean(work.force, width)[begin:]
+    gone = np.flatnonzero(smooth > 0)
+    tense = np.flatnonzero((smooth < limit)[: int(gone[0]) if gone.size else None])
+    if tense.size == 0 or tense[0] > 0:
+        return None
+    faint = np.flatnonzero((smooth > limit * max(single / mean, 1.0))[: int(tense[-1])])
+    return begin + int(faint[0] if faint.size else tense[-1]), begin + int(tense[-1])
 
 
 def _held(work: Extraction, last: int) -> tuple[float, float]:

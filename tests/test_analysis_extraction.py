@@ -87,6 +87,24 @@ def test_snap_duration_and_final_jump() -> None:
     assert features.value("largest_jump_N") == pytest.approx(-sphere_profile().force[-1], rel=0.1)
 
 
+@pytest.mark.parametrize("power", [1, 1.5, 2])
+@pytest.mark.parametrize("jump", [0.0, 0.9])
+def test_a_contact_that_fades_out_is_followed_to_its_end(power: float, jump: float) -> None:
+    place = np.linspace(-0.05e-3, 0.3e-3, 20000)
+    left = np.clip(1 - place / 0.3e-3, 0, 1) ** power
+    force = -0.5 * np.minimum(place / 0.03e-3, 1.0) * left
+    force = np.where(place > 0.1e-3, (1 - jump) * force, force)
+    experiment = replace(FAST, rate=1000.0, retract_speed=10e-6)
+    for seed in range(3):
+        profile = Profile(place, force, np.zeros(place.size))
+        run, _ = pull_off_run(profile, experiment, QUIET, seed=seed, sensors=Sensors(creep_time=9.0))
+        features = analyze(run).features
+        distance, energy = features["pull_off_distance_m"], features.value("adhesion_energy_J")
+        assert abs(distance.value - 0.3e-3) < 3 * distance.uncertainty
+        assert distance.uncertainty < 0.06 * 0.3e-3
+        assert energy == pytest.approx(-np.trapezoid(force[place > 0], place[place > 0]), rel=2e-3)
+
+
 def test_energy_is_split_at_the_main_jump() -> None:
     profile = sphere_profile()
     middle = profile.retraction.size * 3 // 4
