@@ -345,18 +345,24 @@ def _signals(controls: Controls, opened: Opened) -> Iterator[None]:
         yield
         return
     count = 0
+    sending = False
     untold: list[str] = []
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        nonlocal count
+        nonlocal count, sending
         count += 1
         if count == 1:
             controls.stop()
             return
+        if sending:  # this signal has interrupted the sending of the stop, and would wait for it
+            return
+        sending = True
         try:
             controls.emergency_stop()
         except DeviceError as error:  # the loop ends the run at its next frame all the same
             untold.append(str(error))
+        finally:
+            sending = False
 
     numbers = [getattr(signal, name) for name in _ENDING_SIGNALS if hasattr(signal, name)]
     numbers = [number for number in numbers if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN]

@@ -159,6 +159,33 @@ def test_nothing_moves_after_an_emergency_stop(
     assert recorded[1] == ending.exit_code
 
 
+def test_signals_that_come_while_the_stop_is_being_sent_do_not_pile_up(
+    request_for: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A terminal that hangs, and its user, send many; each would wait for the port that the one before it holds."""
+    sent: list[int] = []
+    within = 0
+
+    def send(stage: DirectStage) -> None:
+        nonlocal within
+        within += 1
+        sent.append(within)
+        if len(sent) < 10:
+            signal.raise_signal(signal.SIGINT)
+        within -= 1
+
+    class Hasty(Observer):
+        def step(self, event: Any) -> None:
+            if event.name == "approach" and not sent:
+                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(signal.SIGTERM)
+                signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(DirectStage, "emergency_stop", send)
+    assert run_scene(request_for(observers=[Hasty()])).exit_code == 130
+    assert sent == [1, 1]  # the next signal after it sends it again
+
+
 @pytest.fixture
 def ctrl_c_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     close = Recorder.close
