@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from analysis.quantity import Quantity
+from analysis.run import Run
 from model import jkr
 from model.parameters import Parameters
 
@@ -35,6 +36,12 @@ def _without_gain(force: Quantity) -> Quantity:
     parts = {source: part for source, part in force.budget.items() if source != "force calibration"}
     total = math.sqrt(sum(part**2 for part in parts.values())) if parts else force.uncertainty
     return Quantity(force.value, total, force.unit, force.explanation, parts)
+
+
+def area_of(run: Run, key: str) -> float | None:
+    """Return an area of the run's settings, m^2, or ``None``."""
+    area = run.settings.get(key)
+    return float(area) * (1e-6 if key.endswith("_mm2") else 1e-12) if isinstance(area, int | float) else None
 
 
 def full_contact_radius(parameters: Parameters) -> float:

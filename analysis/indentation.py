@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.derived import validity
+from analysis.derived import area_of, validity
 from analysis.errors import FeatureMissing
 from analysis.extraction import Details, Extraction, extraction_step
 from analysis.numerics import RECTANGULAR, Array, block_means
@@ -117,12 +117,6 @@ def real_contact_area(work: Extraction) -> Details:
 def projected_area(run: Run) -> float | None:
     """Return the projected area measured for a run, m^2, or ``None``."""
     return area_of(run, "projected_area_um2" if run.protocol == "fiber" else "contact_area_mm2")
-
-
-def area_of(run: Run, key: str) -> float | None:
-    """Return an area of the run's settings, m^2, or ``None``."""
-    area = run.settings.get(key)
-    return float(area) * (1e-6 if key.endswith("_mm2") else 1e-12) if isinstance(area, int | float) else None
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,10 @@ class Condition:
         Position on the membrane (indentation) or name of the sample; empty where there is none.
     details
         Symbol and value of every other setting: gripper, membrane, preload, speeds, dwell.
+    material
+        Of the substrate.
+    place_number
+        Which of the scene's places it is; orders them.
     shown
         Symbols of the details in which conditions of this kind differ; ``group`` finds them, the name holds them.
     """
@@ -55,6 +59,8 @@ class Condition:
     pressure: float | None = None
     place: str = ""
     details: tuple[tuple[str, str], ...] = ()
+    material: str = "glass"
+    place_number: float = field(default=0.0, compare=False)
     shown: tuple[str, ...] = field(default=(), compare=False)
 
     @classmethod
@@ -62,21 +68,28 @@ class Condition:
         """Read the condition from the run's scene."""
         gripper = str(run.settings.get("gripper", "rigid"))
         place = str(run.settings.get("position", run.settings.get("sample", "")))
+        number = float(run.settings.get("place_number", 0))
         details = tuple(_details(run))
+        material = str(run.settings.get("material", "glass"))
         if run.parameters is None:
-            return cls(run.protocol, gripper, place=place, details=details)
+            return cls(run.protocol, gripper, place=place, details=details, material=material, place_number=number)
         substrate = run.parameters.substrate
         pressure = None if run.pressure is None else run.parameters.gas.initial_pressure
-        return cls(
-            run.protocol, gripper, substrate.shape == "flat", substrate.diameter or 0.0, pressure, place, details
-        )
+        flat, diameter = substrate.shape == "flat", substrate.diameter or 0.0
+        return cls(run.protocol, gripper, flat, diameter, pressure, place, details, material, number)
+
+    @property
+    def on_glass(self) -> bool:
+        """Whether the substrate is of the papers' usual material."""
+        return self.material.casefold() == "glass"
 
     @property
     def substrate(self) -> str:
         """Name of the substrate as in the papers' tables."""
-        if self.flat:
-            return f"flat disk {self.diameter * 1e3:g} mm" if self.diameter else "Flat Glass"
-        return f"d_b {self.diameter * 1e3:g} mm"
+        if self.flat and not self.diameter:
+            return "Flat Glass" if self.on_glass else self.material
+        words = f"{'flat disk' if self.flat else 'd_b'} {self.diameter * 1e3:g} mm"
+        return words if self.on_glass else f"{words}, {self.material}"
 
     @property
     def distinction(self) -> str:
@@ -86,6 +99,8 @@ class Condition:
     def __str__(self) -> str:
         pressure = "vented" if self.pressure is None else f"P_0 = {_kilopascal(self.pressure)}"
         parts = [self.substrate, pressure] if self.protocol == "pull_off" else [self.protocol, self.place]
+        if self.protocol != "pull_off" and not self.on_glass:
+            parts.append(self.material)
         if self.gripper != "rigid":
             parts.insert(0, f"{self.gripper} gripper")
         return ", ".join(part for part in (*parts, self.distinction) if part)
@@ -219,10 +234,10 @@ def _kind(condition: Condition) -> Condition:
     return replace(condition, pressure=None, details=())
 
 
-def _order(condition: Condition) -> tuple[str, str, bool, float, float, str, tuple[tuple[str, str], ...]]:
+def _order(condition: Condition) -> tuple[object, ...]:
     pressure = np.inf if condition.pressure is None else -condition.pressure
-    kind = (condition.protocol, condition.gripper, condition.flat, condition.diameter)
-    return (*kind, pressure, condition.place, condition.details)
+    kind = (condition.protocol, condition.gripper, not condition.on_glass, condition.flat, condition.diameter)
+    return (*kind, condition.material, pressure, condition.place_number, condition.place, condition.details)
 
 
 def _outliers(members: Sequence[Analysis]) -> dict[str, str]:

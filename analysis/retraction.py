@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from analysis.derived import full_contact_area, full_contact_radius
+from analysis.derived import area_of, full_contact_area, full_contact_radius
 from analysis.errors import FeatureMissing
 from analysis.extraction import CONTACT_TESTS, SMOOTHING, Details, Extraction, extraction_step
 from analysis.numerics import RECTANGULAR, Array, ForceJump, LocalFit, find_jumps, fit_around, fit_window, running_mean
@@ -384,19 +384,24 @@ def gas_work(work: Extraction) -> Details:
     title="Stress",
     protocols=("pull_off", "punch"),
     after=("pull-off",),
-    gives={"adhesion_stress_Pa": "F_p over the full contact pi r_e^2 (large spheres and flats)"},
+    gives={"adhesion_stress_Pa": "F_p over the contact area: measured, or pi r_e^2 (large spheres and flats)"},
 )
 def stress(work: Extraction) -> Details:
-    """Divide F_p by the contact area, known only where the contact is full: flats and large spheres.
+    """Divide F_p by the contact area: measured (``contact_area_mm2``), else that of a full contact.
 
-    The papers use r_e = 7.3 mm there (1.67 cm^2), an average estimate; on smaller spheres the area could not be seen.
-    Its uncertainty is that of r_e (``effective_radius_uncertainty_mm``, 0.1 mm unless the scene says otherwise).
+    The contact is full on flats and large spheres. The papers use r_e = 7.3 mm there (1.67 cm^2), an average estimate;
+    with the rigid gripper the area could not be seen on smaller spheres. Its uncertainty is that of r_e
+    (``effective_radius_uncertainty_mm``, 0.1 mm unless the scene says otherwise).
     """
+    measured = area_of(work.run, "contact_area_mm2")
+    if measured is not None:
+        work.set(adhesion_stress_Pa=work.values["pull_off_force_N"] / measured)
+        return {"decision": f"A_c = {measured * 1e4:.3f} cm², measured"}
     parameters = work.run.parameters
     if parameters is None:
         raise FeatureMissing("without parameters the contact area is unknown")
     if parameters.substrate.radius < 3 * parameters.gripper.radius:
-        raise FeatureMissing("the contact area on so small a sphere is unknown")
+        raise FeatureMissing("the contact on so small a sphere is not full, and its area was not measured (--areas)")
     area = full_contact_area(full_contact_radius(parameters)).value
     work.set(adhesion_stress_Pa=work.values["pull_off_force_N"] / area)
     return {"decision": f"A_c = {area * 1e4:.3f} cm²"}

@@ -23,6 +23,9 @@ VECTORISED = {"cone": True, "cone-2017": False}
 BLOCK = {True: 4096, False: 1}
 """Scenes per block of a vectorised model, and of one that solves scene by scene."""
 
+FEW = 3
+"""So many blocks are done sooner than processes are started."""
+
 Row = dict[str, Any]
 
 
@@ -30,7 +33,7 @@ def sweep(
     scenes: Sequence[Parameters],
     model: str = "cone",
     *,
-    processes: int = 1,
+    processes: int | None = 1,
     scheduler: str | None = None,
     progress: Callable[[Iterable[list[Row]], int], Iterable[list[Row]]] | None = None,
 ) -> pd.DataFrame:
@@ -43,7 +46,7 @@ def sweep(
     model
         One of ``model.MODELS``.
     processes
-        Number of worker processes; 1 computes here.
+        Number of worker processes; 1 computes here; ``None``: one per core, where there are more blocks than a few.
     scheduler
         Address of a Dask scheduler (``tcp://host:8786``) to use instead.
     progress
@@ -68,6 +71,8 @@ def sweep(
         raise InvalidParameter(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
     size = BLOCK[model in VECTORISED]
     blocks = [list(scenes[first : first + size]) for first in range(0, len(scenes), size)]
+    if processes is None and len(blocks) <= FEW:
+        processes = 1
     finished: Iterable[list[Row]] = on_all_cores(
         partial(solve_block, model), blocks, workers=processes, scheduler=scheduler, lost=_lost_block
     )

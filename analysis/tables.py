@@ -9,13 +9,8 @@ from dataclasses import dataclass
 from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
-from analysis.derived import (
-    adhesion_efficiency,
-    adhesion_stress,
-    enhancement_ratio,
-    full_contact_area,
-    full_contact_radius,
-)
+from analysis.derived import adhesion_efficiency, adhesion_stress, enhancement_ratio
+from analysis.pipeline import Analysis
 from analysis.published import TABLE_S3, TABLE_S4, JkrTable
 from analysis.quantity import Quantity, with_uncertainty
 from analysis.repeats import Condition, Group, Pooled
@@ -118,8 +113,8 @@ def characterization(groups: Iterable[Group], gripper: str = "rigid", reference:
         gripper, f"Table S2 | Characterization results of the {gripper} adhesion system"
     )
     notes = (
-        f"Efficiencies against σ_ad = {_text(stress, 1e-3)} kPa ({stress.explanation}).",
-        "Forces: mean ± standard uncertainty of the mean. Stress is F_off / (π r_e²), r_e with its uncertainty.",
+        f"Efficiencies, of glass only, against σ_ad = {_text(stress, 1e-3)} kPa ({stress.explanation}).",
+        "Forces: mean ± standard uncertainty of the mean. Stress is F_off / A_c; A_c was measured, or is π r_e².",
         "A single pressure counts as the lowest where it is suction, and as the highest otherwise.",
     )
     return Table(name, ("Characterization Parameters", *cells), rows, notes)
@@ -127,7 +122,7 @@ def characterization(groups: Iterable[Group], gripper: str = "rigid", reference:
 
 def _column(groups: Sequence[Group], reference: Quantity) -> tuple[str, ...]:
     by_force = sorted(groups, key=lambda members: _mean(members, "pull_off_force_N").value)
-    area = _area(by_force[0])
+    area, on_glass = _area(groups), groups[0].condition.on_glass
     ends: tuple[Group | None, Group | None] = (by_force[0], by_force[-1])
     if len(groups) == 1:
         gas = groups[0].pooled("initial_pressure_Pa")
@@ -141,7 +136,7 @@ def _column(groups: Sequence[Group], reference: Quantity) -> tuple[str, ...]:
         *map(_optional, forces),
         NOT_AVAILABLE if low is None or high is None else _text(enhancement_ratio(high, low)),
         *(_optional(stress, 1e-3) for stress in stresses),
-        *(_optional(None if s is None else adhesion_efficiency(s, reference), 100) for s in stresses),
+        *(_optional(None if s is None or not on_glass else adhesion_efficiency(s, reference), 100) for s in stresses),
         ", ".join(NOT_AVAILABLE if members is None else str(len(members.kept)) for members in ends),
     )
 
@@ -156,13 +151,19 @@ def _pressures(groups: Sequence[Group], ends: tuple[Group | None, Group | None])
     return found[-1], found[0]
 
 
-def _area(members: Group) -> Quantity | None:
-    """Return the area of the full contact (as ``analysis.retraction.stress`` decides), or ``None``."""
-    run = members.kept[0].run
-    if members.pooled("adhesion_stress_Pa") is None or run.parameters is None:
-        return None
-    uncertainty = float(run.settings.get("effective_radius_uncertainty_mm", 0.0)) * 1e-3
-    return full_contact_area(full_contact_radius(run.parameters), uncertainty)
+def _area(groups: Iterable[Group]) -> Quantity | None:
+    """Return the mean of the areas that the stresses were taken of, those measured if any was, or ``None``."""
+    known = [a for members in groups for a in members.kept if "adhesion_stress_Pa" in a.features]
+    known = [a for a in known if "contact_area_mm2" in a.run.settings] or known
+    return _average([_area_under(a) for a in known]) if known else None
+
+
+def _area_under(analysis: Analysis) -> Quantity:
+    """Return the area that a run's stress was taken of."""
+    force, stress = (analysis.features[name] for name in ("pull_off_force_N", "adhesion_stress_Pa"))
+    sources = (stress.budget.get(source, 0.0) for source in ("contact area", "effective radius"))
+    area = force.value / stress.value
+    return Quantity(area, area * math.hypot(*sources) / stress.value, "m^2", budget={"repeats": 0.0})
 
 
 def _mean(members: Group, feature: str) -> Quantity:

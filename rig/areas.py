@@ -23,6 +23,13 @@ SETTINGS = {
 }
 """Columns beside ``recording``, and the key of the scene each one stands for."""
 
+USED_BY = {
+    "contact_area_mm2": ("pull_off", "indentation", "punch"),
+    "real_area_um2": ("fiber",),
+    "projected_area_um2": ("fiber",),
+}
+"""Protocols that each area is of use to."""
+
 Areas = Mapping[str, Mapping[str, float]]
 """Settings by the recording's name."""
 
@@ -84,6 +91,16 @@ def with_area(run: Run, areas: Areas) -> Run:
 def strangers(areas: Areas, names: Iterable[str]) -> list[str]:
     """Return the recordings of an areas file that are not among ``names``: left out, or misspelt."""
     return sorted(set(areas) - set(names))
+
+
+def useless(areas: Areas, runs: Iterable[Run]) -> list[str]:
+    """Say which areas are of no use to the runs they were measured for."""
+    return [
+        f"{run.name}: {key} is of no use to a {run.protocol} test"
+        for run in runs
+        for key, protocols in USED_BY.items()
+        if key in areas.get(run.name, {}) and run.protocol not in protocols
+    ]
 
 
 def area_line(recording: str, area: Quantity) -> str:

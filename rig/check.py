@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import accumulate
 
 from rig.bench import OVERLOAD, Bench, PumpSection
@@ -59,6 +60,7 @@ def reasons(scene: Scene, bench: Bench) -> list[str]:
     """Return why the bench cannot carry out the scene, each with value, limit and remedy; empty if it can."""
     parts = (
         _instruments,
+        _material,
         _forces,
         _contact,
         _resolution,
@@ -88,6 +90,20 @@ def _instruments(scene: Scene, bench: Bench) -> list[str]:
         return []
     missing = [name for name in ("pump", "pressure") if getattr(bench, name) is None]
     return [f"it needs [{name}], which the bench does not have; add the table" for name in missing]
+
+
+def _material(scene: Scene, bench: Bench) -> list[str]:
+    """Emulated substrates are of glass; the rubber film is known with the soft gripper alone (Table S2)."""
+    from rig.emulation import is_rubber_film
+
+    material = scene.substrate.material
+    known = material.casefold() == "glass" or (is_rubber_film(scene) and scene.gripper.kind == "soft")
+    if known or not bench.is_emulated:
+        return []
+    return [
+        f"substrate material {material!r} is none of which the emulated bench knows the adhesion; choose glass, or "
+        "for the soft gripper a flat rubber film"
+    ]
 
 
 def _forces(scene: Scene, bench: Bench) -> list[str]:
@@ -152,9 +168,10 @@ def _published_force(scene: Scene) -> float | None:
     if scene.gripper.kind != "soft" or not isinstance(protocol, PullOffSection):
         return None
     from drivers.emulated.soft import SoftGripper
+    from rig.emulation import is_rubber_film
 
     diameter = scene.substrate.diameter_mm if scene.substrate.shape == "sphere" else None
-    gripper = SoftGripper() if diameter is None else SoftGripper(diameter * 1e-3)
+    gripper = SoftGripper(math.inf if diameter is None else diameter * 1e-3, rubber=is_rubber_film(scene))
     return gripper.pull_off_force((protocol.initial_pressure_kPa or 0.0) * 1e3)
 
 

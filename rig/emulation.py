@@ -40,6 +40,11 @@ def _left_on(world: Truth, stage: StageSection) -> Truth:
     return replace(world, train=replace(world.train, start_position=stage.start_mm * 1e-3))
 
 
+def is_rubber_film(scene: Scene) -> bool:
+    """Whether the substrate is the flat rubber film of Table S2."""
+    return scene.substrate.shape == "flat" and scene.substrate.material.casefold() == "rubber film"
+
+
 def truth(scene: Scene, seed: int) -> Truth:
     """Return a world with the scene's geometry; its membrane is never the scene's."""
     from drivers.emulated.chamber import Chamber
@@ -63,7 +68,8 @@ def truth(scene: Scene, seed: int) -> Truth:
     if kind in special:
         return special[kind]()
     if gripper.kind == "soft":
-        return Truth.soft(diameter if scene.substrate.shape == "sphere" else None, chamber_volume=volume, seed=seed)
+        sphere, rubber = scene.substrate.shape == "sphere", is_rubber_film(scene)
+        return Truth.soft(diameter if sphere else None, rubber=rubber, chamber_volume=volume, seed=seed)
     return Truth.pull_off(
         scene.substrate.shape,
         diameter,

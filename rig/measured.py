@@ -84,7 +84,8 @@ def _provenance(recording: Recording) -> dict[str, object]:
 
 def _substrate(recording: Recording) -> str:
     substrate = recording.scene.substrate
-    return substrate.shape if substrate.diameter_mm is None else f"{substrate.shape} {substrate.diameter_mm:g} mm"
+    words = substrate.shape if substrate.diameter_mm is None else f"{substrate.shape} {substrate.diameter_mm:g} mm"
+    return words if substrate.material == "glass" else f"{words}, {substrate.material}"
 
 
 def _settings(recording: Recording) -> dict[str, float | str]:
@@ -95,10 +96,13 @@ def _settings(recording: Recording) -> dict[str, float | str]:
     }
     gripper = recording.scene.gripper
     settings["gripper"] = gripper.kind
+    settings["material"] = recording.scene.substrate.material
     settings["effective_radius_uncertainty_mm"] = gripper.effective_radius_uncertainty_mm
     place = recording.configuration.get("place", "")
     if place:
         settings["sample" if protocol.name == "fiber" else "position"] = place
+        places = getattr(protocol, "positions", ())
+        settings["place_number"] = places.index(place) if place in places else len(places)
     return settings
 
 

@@ -27,6 +27,7 @@ class SubstrateSection(Section):
 
     shape: Literal["sphere", "flat"]
     diameter_mm: Annotated[float, Field(ge=0.1, le=1e7)] | None = None
+    material: Annotated[Title, Field(min_length=1)] = "glass"
 
     @rule
     def _sphere_has_a_diameter(self) -> SubstrateSection:
@@ -91,6 +92,8 @@ class PullOffSection(ContactSection):
     name: Literal["pull_off"] = "pull_off"
     initial_pressure_kPa: Annotated[float, Field(gt=-101.3, le=1000)] | None = None
     pressure_tolerance_kPa: Annotated[float, Field(gt=0, le=10)] = 0.05
+    contact_area_mm2: Annotated[float, Field(gt=0)] | None = None
+    contact_area_uncertainty_mm2: Annotated[float, Field(ge=0)] | None = None
 
 
 class IndentationSection(ContactSection):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.synthetic import Profile, pull_off_run
-from rig.areas import read_areas, strangers, with_area
+from rig.areas import read_areas, strangers, useless, with_area
 from rig.cli import main
 from rig.errors import FileError
 
@@ -52,6 +52,12 @@ def test_what_is_no_area_is_refused_by_line(tmp_path: Path, text: str, words: st
         read_areas(written(tmp_path, text))
     with pytest.raises(FileError, match=r"nowhere\.csv"):
         read_areas(tmp_path / "nowhere.csv")
+
+
+def test_an_area_that_a_test_has_no_use_for_is_told(tmp_path: Path) -> None:
+    run, _ = pull_off_run(Profile.jkr(4.0, 4e-3, 2e6, 0.095))
+    areas = {run.name: {"contact_area_mm2": 60.0, "real_area_um2": 1.0}}
+    assert useless(areas, [run]) == [f"{run.name}: real_area_um2 is of no use to a pull_off test"]
 
 
 def image(folder: Path) -> Path:

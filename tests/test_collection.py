@@ -244,6 +244,19 @@ def test_bad_words_are_refused_by_the_parser(made: Path, words: list[str], capsy
     assert words[0] in capsys.readouterr().err
 
 
+def test_tables_tell_what_they_left_out_and_what_they_do_not_know(
+    made: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("analysis.repeats._outliers", lambda members: {"second": "F_p = far off"})
+    code, out, _ = analyze(capsys, made / "first.h5", made / "second.h5", "--tables")
+    assert code == 0
+    assert "| second |" in out
+    assert "far off" in out
+    code, out, error = analyze(capsys, made / "leak.h5", "--tables")
+    assert (code, out) == (0, "")
+    assert "no such tests (leak)" in error
+
+
 def test_figures_say_what_they_do_not_show(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "z.png"
     files = [str(made / f"{name}.h5") for name in ("first", "leak", "text")]

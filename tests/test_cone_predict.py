@@ -202,6 +202,23 @@ def test_processes_give_the_same_bits():
     pd.testing.assert_frame_equal(alone, shared, check_exact=True)
 
 
+def test_a_sweep_takes_every_core_unless_told_otherwise(capsys, monkeypatch):
+    asked = []
+
+    def on_processes(function, items, count, lost):
+        asked.append(count)
+        return map(function, items)
+
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    monkeypatch.setattr("analysis.batch._on_processes", on_processes)
+    four = ("sweep", SPHERE, "--model", "membrane", "--vary", "work_of_adhesion_J_m2=1:4:4")
+    assert run(capsys, *four)[0] == 0
+    assert asked == [3]
+    assert run(capsys, *four, "--processes", "1")[0] == 0
+    assert run(capsys, "sweep", SPHERE, "--vary", "work_of_adhesion_J_m2=1:4:4")[0] == 0
+    assert asked == [3]
+
+
 def test_a_cluster_gives_the_same_bits():
     distributed = pytest.importorskip("distributed")
     points = scenes(4200)

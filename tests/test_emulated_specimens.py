@@ -135,6 +135,11 @@ def test_the_soft_gripper_is_table_s2(diameter, row):
     assert SoftGripper(diameter).pull_off_force(pressure) == pytest.approx(force)
 
 
+def test_the_soft_gripper_on_the_rubber_film_is_table_s2():
+    highest, lowest = (SoftGripper(rubber=True).pull_off_force(pressure) for pressure in (0.3e3, -50.9e3))
+    assert (highest, lowest) == pytest.approx((0.08, 0.61))
+
+
 def test_the_soft_gripper_between_the_rows_and_diameters():
     gripper = SoftGripper(40e-3)
     assert SoftGripper(30e-3).pull_off_force(-30e3) < gripper.pull_off_force(-30e3)

@@ -14,7 +14,7 @@ from drivers.emulated.chamber import ATMOSPHERE
 from drivers.emulated.electronics import Cell
 from rig.bench import load_bench, parse_bench
 from rig.calibrate import calibrate
-from rig.check import check
+from rig.check import check, reasons
 from rig.cli import main
 from rig.errors import Refused
 from rig.measured import load_run
@@ -247,6 +247,20 @@ def test_the_soft_gripper_is_refused_where_its_force_would_end_the_run():
     bench, _ = load_bench(None)
     weaker = bench.model_copy(update={"limits": bench.limits.model_copy(update={"tension_N": 3.0})})
     assert "3.61 N" in refused("soft-flat", bench=weaker)
+
+
+def test_substrates_that_the_emulated_bench_does_not_know_are_refused_there_alone():
+    bench, _ = load_bench(None)
+    for name, material, refusals in (
+        ("soft-rubber-film", "Rubber Film", 0),
+        ("soft-flat", "steel", 1),
+        ("flat-low", "Rubber Film", 1),
+    ):
+        scene = parse_scene(scene_text(name), name)
+        changed = scene.model_copy(update={"substrate": scene.substrate.model_copy(update={"material": material})})
+        found = reasons(changed, bench)
+        assert len(found) == refusals
+        assert all("none of which the emulated bench knows" in reason for reason in found)
 
 
 def test_strokes_beyond_the_pressure_limits_are_refused():

@@ -56,7 +56,8 @@ def _of_substrate(material: Material, diameter: float | None) -> list[Group]:
     return [
         members
         for members in material.pull_offs()
-        if members.condition.flat == (diameter is None)
+        if members.condition.on_glass
+        and members.condition.flat == (diameter is None)
         and (diameter is None or abs(members.condition.diameter - diameter) < 1e-6)
     ]
 

@@ -20,13 +20,16 @@ TABLE_S2 = {
 }
 """By sphere diameter (m; infinite is flat glass): (pressure, force) highest and lowest, contact area (Pa, N, m^2)."""
 
+RUBBER = ((0.3e3, 0.08), (-50.9e3, 0.61), 2.5e-4)
+"""The same on the flat rubber film."""
+
 BREAKING = 3.0
 """The contact ends at so many times the distance of the largest force."""
 
 
 @dataclass(frozen=True, slots=True)
 class SoftGripper:
-    """Soft gripper on glass, after Table S2.
+    """Soft gripper, after Table S2.
 
     Attributes
     ----------
@@ -38,15 +41,20 @@ class SoftGripper:
         Stiffness in compression, N/m (assumed).
     factor
         Of this specimen's force over the table's.
+    rubber
+        On the rubber film, not on glass.
     """
 
     substrate_diameter: float = math.inf
     distance: float = 1.2e-3
     compression: float = 1500.0
     factor: float = 1.0
+    rubber: bool = False
 
     def pull_off_force(self, pressure: float) -> float:
         """Largest tension (N) at a chamber pressure (Pa), between table rows straight in the sphere's curvature."""
+        if self.rubber:
+            return self.factor * max(_line(RUBBER[0], RUBBER[1], pressure), 0.0)
         rows = sorted((1 / diameter, row) for diameter, row in TABLE_S2.items())
         curvature = min(1 / self.substrate_diameter, rows[-1][0])
         (flatter, below), (rounder, above) = next(
@@ -74,6 +82,8 @@ class SoftGripper:
 
     @property
     def _area(self) -> float:
+        if self.rubber:
+            return RUBBER[2]
         nearest = min(TABLE_S2, key=lambda diameter: abs(1 / diameter - 1 / self.substrate_diameter))
         return TABLE_S2[nearest][2]
 

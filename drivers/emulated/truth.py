@@ -150,10 +150,15 @@ class Truth:
         return cls(punch, Chamber(vented=True), Train(contact_position=20e-3 + 20e-6 * draw()))
 
     @classmethod
-    def soft(cls, diameter: float | None = None, *, chamber_volume: float = 7.2e-6, seed: int = 0) -> Self:
-        """Return the soft gripper on a glass sphere of this diameter (m) or on a flat: empirical, after Table S2."""
+    def soft(
+        cls, diameter: float | None = None, *, rubber: bool = False, chamber_volume: float = 7.2e-6, seed: int = 0
+    ) -> Self:
+        """Return the soft gripper on a glass sphere of this diameter (m), on flat glass or on a flat rubber film.
+
+        Empirical, after Table S2.
+        """
         draw = np.random.default_rng([seed, 0x50F7]).normal
-        gripper = SoftGripper(math.inf if diameter is None else diameter, factor=1 + 0.03 * draw())
+        gripper = SoftGripper(math.inf if diameter is None else diameter, factor=1 + 0.03 * draw(), rubber=rubber)
         chamber = Chamber(volume=chamber_volume * (1 + 0.004 * draw()))
         return cls(gripper, chamber, Train(contact_position=20e-3 + 20e-6 * draw()))
 

@@ -12,6 +12,7 @@ from rig.commands import count
 
 if TYPE_CHECKING:
     from analysis.batch import Analyzed
+    from analysis.repeats import Group
     from rig.collection import Collection
 
 FOR_FEATURES = ("csv", "tables", "report", "pdf", "curves", "afm")
@@ -45,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse and print or write what was asked for; 1 where something had to be left out, 2 where everything had."""
-    from rig.areas import read_areas, strangers
+    from rig.areas import read_areas, strangers, useless
     from rig.collection import collect, own_names
     from rig.errors import FileError
     from rig.output import prepare, prepare_folder
@@ -69,6 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     for name in strangers(areas, own_names(found.files)):
         print(f"rig analyze: {arguments.areas}: {name} is not among the recordings", file=sys.stderr)
+    for words in useless(areas, (analyzed.analysis.run for analyzed in found.runs)):
+        print(f"rig analyze: {arguments.areas}: {words}", file=sys.stderr)
     if any(getattr(arguments, name) for name in FOR_FEATURES):
         found.leave_calibrations()
     unwritten = _write(arguments, found) if found.runs else []
@@ -175,6 +178,7 @@ def _write_afm(directory: Path, runs: list[Analyzed]) -> list[str]:
 
 def _print(arguments: argparse.Namespace, found: Collection) -> None:
     from analysis.export import features_csv
+    from analysis.repeats import group
 
     analyses = [analyzed.analysis for analyzed in found.runs]
     if arguments.json:
@@ -182,15 +186,27 @@ def _print(arguments: argparse.Namespace, found: Collection) -> None:
     elif arguments.csv and analyses:
         print(features_csv(analyses), end="")
     elif arguments.tables and analyses:
-        from analysis.repeats import group
-        from analysis.tables import all_tables
-
-        print("\n".join(table.markdown() for table in all_tables(group(analyses))))
+        _print_tables(group(analyses))
     elif not any(getattr(arguments, name) for name in FOR_FEATURES):
         for calibrated in found.calibrations:
             print(f"{calibrated.source.path}\n{calibrated.calibration}")
         for analyzed in found.runs:
             _print_words(analyzed)
+
+
+def _print_tables(groups: list[Group]) -> None:
+    """Print the papers' tables and what was left out of them; say so where no table knows these tests."""
+    from analysis.report import outlier_table
+    from analysis.tables import all_tables
+
+    tables = all_tables(groups)
+    if tables:
+        print("\n".join(table.markdown() for table in [*tables, *outlier_table(groups)]))
+        return
+    protocols = ", ".join(dict.fromkeys(members.condition.protocol for members in groups))
+    print(
+        f"rig analyze: Tables S1 to S5 know no such tests ({protocols}). Remedy: leave out --tables.", file=sys.stderr
+    )
 
 
 def as_json(found: Collection) -> dict[str, Any]:

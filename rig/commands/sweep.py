@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--model", choices=MODELS, default="cone", help="adhesion model (default: cone)")
     parser.add_argument("--out", type=Path, metavar="CSV", help="write the table here instead of standard output")
-    parser.add_argument("--processes", type=count, default=1, metavar="N", help="worker processes (default: 1)")
+    parser.add_argument("--processes", type=count, metavar="N", help="worker processes (default: one per core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786")
     parser.add_argument("--rigid-bound", action="store_true", help="soft gripper: sweep the rigid one, as a bound")
 
