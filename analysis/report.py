@@ -312,7 +312,7 @@ def _pdf_pages(report: Report, pages: PdfPages) -> None:
     for number in report.figures():
         chosen = find(number)
         with canvas(*chosen.size) as figure:
-            chosen.draw(figure, report.material)
+            chosen.draw_marked(figure, report.material)
             pages.savefig(figure)  # type: ignore[no-untyped-call]
     for analyzed in (analyzed for _, runs in report.by_condition() for analyzed in runs):
         for data in (analyzed.overview, analyzed.reasons):

@@ -90,6 +90,8 @@ class Run:
         Whether the sequence reached its end.
     pump_volume
         (n,), m^3, net volume the pump has displaced into the chamber, or ``None``.
+    emulated
+        Whether the instruments were: no experiment. Every picture says so.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Run:
     settings: Mapping[str, float | str] = field(default_factory=dict)
     complete: bool = True
     pump_volume: Array | None = None
+    emulated: bool = False
 
     @property
     def time(self) -> Array:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from rig.errors import FileError
-from rig.measured import began
+from rig.measured import began, is_emulated
 from rig.recording import Recording
 from rig.scene import ComplianceSection, DeadWeightsSection
 from rig.validation import Section
@@ -278,7 +278,15 @@ def _picture(
 ) -> FitPicture:
     from analysis.figures.fit_picture import FitPicture
 
-    return FitPicture(recording.scene.title, result, *data, *labels, residual_scale=scale, joined=joined)
+    return FitPicture(
+        recording.scene.title,
+        result,
+        *data,
+        *labels,
+        residual_scale=scale,
+        joined=joined,
+        emulated=is_emulated(recording),
+    )
 
 
 def _quoted(text: str) -> str:

@@ -36,6 +36,7 @@ def as_run(recording: Recording) -> Run:
         settings=_settings(recording),
         complete=recording.ending is not None and recording.ending[1] == 0,
         pump_volume=_pump_volume(recording),
+        emulated=is_emulated(recording),
     )
 
 
@@ -46,9 +47,12 @@ def began(recording: Recording) -> datetime:
 
 
 def is_emulated(recording: Recording) -> bool:
-    """Whether the numbers come from emulated instruments, in this program or served to it."""
+    """Whether the numbers come from emulated instruments, in this program or served to it.
+
+    Those that are served, by ``rig emulate`` say, tell it in place of their serial number.
+    """
     identities = recording.info.get("identities", {})
-    return recording.bench.is_emulated or any("emulated" in str(words) for words in identities.values())
+    return recording.bench.is_emulated or any("emulated" in str(words).casefold() for words in identities.values())
 
 
 def provenance(recording: Recording) -> dict[str, object]:
@@ -68,7 +72,7 @@ def _provenance(recording: Recording) -> dict[str, object]:
         "place": told.get("place", ""),
         "substrate": _substrate(recording),
         "initial_pressure_set_point_Pa": None if set_point is None else set_point * 1e3,
-        "seed": int(told["seed"]) if emulated and "seed" in told else None,
+        "seed": int(told["seed"]) if bench.is_emulated and "seed" in told else None,
         "began": began(recording).isoformat(timespec="seconds"),
         "force_calibration": bench.force.calibration.id,
         "pressure_calibration": None,

@@ -6,24 +6,33 @@ import json
 import re
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
+import pandas as pd
 import pytest
 from conftest import SHORT, scene_text
 
+from analysis import analyze as analysis_of
+from analysis.figures.reasons import reasons
+from analysis.figures.run_overview import overview_bytes
+from analysis.figures.style import SETTINGS
 from rig.bench import load_bench
+from rig.calibrate import calibrate
 from rig.campaign import JOURNAL, Journal
 from rig.cli import main
 from rig.collection import Collection, own_names
+from rig.measured import load_run
+from rig.recording import load_recording
 from rig.scene import Scene
 from rig.session import Request, run_scene
 
 PROTOCOL = {**SHORT, "retract_speed_um_s": 200.0}
 
 
-def record(out: Path, name: str = "sphere-60mm-vented", seed: int = 0, **protocol: Any) -> Path:
+def record(out: Path, name: str = "sphere-60mm-vented", seed: int = 0, *, wire: bool = False, **protocol: Any) -> Path:
     text = scene_text(name, **protocol)
     bench, bench_text = load_bench(None)
     scene = Scene.model_validate(tomllib.loads(text))
@@ -326,3 +335,61 @@ def test_a_recorded_text_of_wrong_structure_names_recording_and_key(
     assert code == 2
     assert f"{spoilt}:{part}: {words}" in err
     assert "Traceback" not in err
+
+
+def as_if_elsewhere(path: Path) -> None:
+    """Give a recording a bench whose instruments answer at addresses, as those of ``rig emulate`` do."""
+    first, second, third = (f'connection = "{address}"' for address in ("socket://h:1", "socket://h:2", "grpc://h:3"))
+    emulated = 'connection = "emulated"'
+    with h5py.File(path, "r+") as file:
+        whole = file["entry/configuration/bench"]
+        head, *rest = whole.asstr()[()].split(emulated)
+        whole[()] = head + "".join(part + after for part, after in zip((first, second, third), rest, strict=True))
+
+
+def test_emulated_instruments_that_are_served_are_told_from_real_ones(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = shutil.copy(made / "first.h5", tmp_path / "served.h5")
+    as_if_elsewhere(path)
+    rewrite(path, "run", ("emulated, direct", "NI-DAQmx 24.8.0"))
+    assert not load_recording(path).bench.is_emulated
+    found = json.loads(analyze(capsys, path, "--json")[1])
+    assert found["emulated"] is True
+    assert found["seed"] is None
+    assert "served  (pull_off, EMULATED)" in analyze(capsys, path)[1]
+
+
+def test_figures_of_emulated_recordings_say_so_in_picture_and_data(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [shutil.copy(made / f"{name}.h5", tmp_path) for name in ("first", "second")]
+    svg, table = tmp_path / "f.svg", tmp_path / "f.csv"
+    monkeypatch.setitem(SETTINGS, "svg.fonttype", "none")
+
+    def drawn(number: str, *recordings: str) -> tuple[str, pd.DataFrame]:
+        assert main(["figure", number, "--out", str(svg), *recordings]) == 0
+        return svg.read_text("utf-8"), pd.read_csv(table)
+
+    picture, data = drawn("5c", *files)
+    assert ">EMULATED, no experiment<" in picture
+    assert data.loc[data["source"] == "measured", "EMULATED"].eq("yes").all()
+    assert data.loc[data["source"] != "measured", "EMULATED"].isna().all()
+    monkeypatch.setattr("rig.measured.is_emulated", lambda recording: recording.path.stem == "first")
+    assert ">partly EMULATED, no experiment<" in drawn("5c", *files)[0]
+    monkeypatch.setattr("rig.measured.is_emulated", lambda recording: False)
+    for picture, data in (drawn("5c", *files), drawn("5c")):
+        assert "EMULATED" not in picture
+        assert "EMULATED" not in data
+
+
+def test_the_pictures_of_a_run_say_that_it_is_emulated(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SETTINGS, "svg.fonttype", "none")
+    for name in ("first", "leak"):
+        run = load_run(made / f"{name}.h5")
+        for one, count in ((run, 1), (replace(run, emulated=False), 0)):
+            analysis = analysis_of(one, uncertainties=False)
+            assert overview_bytes(one, analysis, None, "svg").count(b"EMULATED") == count
+            assert reasons(analysis, "svg").count(b"EMULATED") == count
+    picture = calibrate(load_recording(made / "zero.h5")).picture
+    assert picture.emulated

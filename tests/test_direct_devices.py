@@ -108,6 +108,7 @@ def over_the_wire(bench: EmulatedBench) -> tuple[np.ndarray, list[StageStatus], 
     pump = LegatoPump(ends.pump, syringe_diameter=14.43e-3, force_percent=50, settle=0.0, clock=bench.clock)
     channels = [signal_channel(name, f"Dev1/ai{number}") for number, name in enumerate(NAMES)]
     daq = NIDaq(channels, rate=1000.0, connection=ends.daq)
+    assert stage.identity.serial == pump.identity.serial == "EMULATED"
     try:
         return play(stage, pump, daq)
     finally:

@@ -406,6 +406,7 @@ def _draw_fits(axes: Axes, analysis: Analysis, series: Series) -> None:
         series.add(
             f"{analysis.run.name} {fit.model}",
             f"model {fit.model}",
+            [analysis],
             displacement_m=origin - fit.separation,
             force_N=fit.force,
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.chamber import BoyleFit, Leak
-from analysis.figures.style import BLUE, GREY, ORANGE, canvas, plain, save, thin
+from analysis.figures.style import BLUE, GREY, ORANGE, canvas, mark_emulated, plain, save, thin
 from analysis.numerics import Array, block_means, running_mean
 from analysis.pipeline import Analysis
 from analysis.run import Run
@@ -34,6 +34,8 @@ class FitPicture:
         The lower panel shows (y - line) times the scale.
     joined
         Draw the measurement as a line, not as points.
+    emulated
+        Whether the instruments were.
     """
 
     title: str
@@ -46,6 +48,7 @@ class FitPicture:
     residual_label: str
     residual_scale: float = 1.0
     joined: bool = False
+    emulated: bool = False
 
 
 def draw_fit(figure: Figure, content: FitPicture) -> None:
@@ -64,6 +67,8 @@ def draw_fit(figure: Figure, content: FitPicture) -> None:
     below.set_xlabel(content.x_label)
     below.set_ylabel(content.residual_label)
     figure.align_ylabels([above, below])
+    if content.emulated:
+        mark_emulated(figure)
 
 
 def _shown(content: FitPicture, y: Array) -> tuple[Array, Array]:
@@ -95,6 +100,7 @@ def chamber_picture(run: Run, analysis: Analysis) -> FitPicture | None:
             y_label="Volume pumped in [mL]",
             residual_label="Residual [µL]",
             residual_scale=1e3,
+            emulated=run.emulated,
         )
     step = run.step("hold")
     if run.protocol == "leak" and step is not None and isinstance(leak := details.get("leak"), Leak):
@@ -113,5 +119,6 @@ def chamber_picture(run: Run, analysis: Analysis) -> FitPicture | None:
             residual_label="Residual [Pa]",
             residual_scale=1e3,
             joined=True,
+            emulated=run.emulated,
         )
     return None

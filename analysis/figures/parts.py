@@ -50,12 +50,16 @@ class Series:
     def add(self, series: str, source: str, runs: Iterable[Analysis] = (), **columns: Array) -> None:
         """Add one line: its name, ``"measured"`` or ``"model ..."``, and its columns with units in their names.
 
-        ``runs`` are those that a measured line shows.
+        ``runs`` are those that a measured line shows. Where one of them is emulated, the column ``EMULATED`` says so.
         """
         import pandas as pd
 
-        self._runs += [analysis.run.name for analysis in runs]
+        shown = list(runs)
+        self._runs += [analysis.run.name for analysis in shown]
         frame = pd.DataFrame(columns)
+        emulated = [analysis.run.emulated for analysis in shown]
+        if any(emulated):
+            frame.insert(0, "EMULATED", "yes" if all(emulated) else "partly")
         frame.insert(0, "source", source)
         frame.insert(0, "series", series)
         self._rows.append(frame)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, canvas, encode, thin
+from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, canvas, encode, mark_emulated, thin
 from analysis.numerics import LocalFit, running_mean
 from analysis.pipeline import Analysis
 
@@ -34,6 +34,8 @@ def draw_reasons(figure: Figure, analysis: Analysis) -> None:
             axes.set_axis_off()
             words = f"{step}: {analysis.work.failed.get(step, 'does not belong to this protocol')}"
             axes.text(0.5, 0.5, words, ha="center", va="center", wrap=True, transform=axes.transAxes, fontsize=8)
+    if analysis.run.emulated:
+        mark_emulated(figure)
 
 
 def _title(axes: Axes, step: str, decision: object) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from analysis.errors import AnalysisError
-from analysis.figures.style import canvas, encode, save
+from analysis.figures.style import canvas, encode, mark_emulated, save
 from analysis.repeats import Group
 from model.parameters import Parameters
 
@@ -74,6 +74,14 @@ class PaperFigure:
     size: tuple[float, float]
     draw: Draw
 
+    def draw_marked(self, figure: Figure, material: Material) -> pd.DataFrame:
+        """Draw it, and say where what it shows comes from emulated instruments; return the data."""
+        data = self.draw(figure, material)
+        if "EMULATED" in data:
+            real = (data["source"] == "measured") & (data["EMULATED"] != "yes")
+            mark_emulated(figure, partly=bool(real.any()))
+        return data
+
 
 FIGURES: dict[str, PaperFigure] = {}
 """Registered figures by number; ``load`` fills it."""
@@ -116,7 +124,7 @@ def draw(number: str, material: Material, path: Path) -> Path:
     """Draw a figure to ``path`` and its data to the same name with ``.csv``; return the latter."""
     chosen = find(number)
     with canvas(*chosen.size) as figure:
-        data = chosen.draw(figure, material)
+        data = chosen.draw_marked(figure, material)
         save(figure, path)
     material.used.update(data.attrs.get("runs", ()))
     table = path.with_suffix(".csv")
@@ -128,5 +136,5 @@ def picture(number: str, material: Material, kind: str = "png") -> bytes:
     """Return a figure as bytes."""
     chosen = find(number)
     with canvas(*chosen.size) as figure:
-        chosen.draw(figure, material)
+        chosen.draw_marked(figure, material)
         return encode(figure, kind)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from analysis.figures.style import BLACK, BLUE, GREY, ORANGE, canvas, encode, plain, save, thin
+from analysis.figures.style import BLACK, BLUE, GREY, ORANGE, canvas, encode, mark_emulated, plain, save, thin
 from analysis.numerics import Array, running_mean
 from analysis.pipeline import Analysis
 from analysis.quantity import Quantity, with_uncertainty
@@ -83,6 +83,8 @@ def draw_overview(figure: Figure, run: Run, analysis: Analysis, prediction: Pred
     if fit is not None:
         draw_fit(figure, fit)
         return
+    if run.emulated:
+        mark_emulated(figure)
     above, below = figure.subplots(2, 1, height_ratios=[1, 1.25])
     draw_against_time(above, run, analysis)
     if analysis.curve is None:

@@ -57,6 +57,12 @@ def canvas(width: float = 7.0, height: float = 5.0) -> Iterator[Figure]:
         yield figure
 
 
+def mark_emulated(figure: Figure, *, partly: bool = False) -> None:
+    """Say on a picture that what it shows, or part of it, is no experiment."""
+    words = "partly EMULATED, no experiment" if partly else "EMULATED, no experiment"
+    figure.supxlabel(words, x=0.99, ha="right", fontsize=8, color=ORANGE, weight="bold")
+
+
 FORMATS: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "svg": {"Date": None, "Creator": None},

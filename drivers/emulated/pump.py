@@ -400,7 +400,7 @@ class EmulatedLegato:
 
     def _version(self, words: Arguments) -> tuple[str, ...]:
         del words
-        return ("Firmware:      v3.0.6", f"Pump address:  {self._address}", "Serial number: D101754")
+        return ("Firmware:      v3.0.6", f"Pump address:  {self._address}", "Serial number: EMULATED")
 
     def _address_command(self, words: Arguments) -> tuple[str, ...]:
         if not words:

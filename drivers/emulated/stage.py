@@ -157,7 +157,7 @@ class EmulatedController:
         self._address = address
         self._on_target_stuck = on_target_stuck
         self._reboot_time = reboot_time
-        self._identity = f"(c)2015 Physik Instrumente (PI) GmbH & Co. KG, {model}, 0021550019, 1.2.1.0"
+        self._identity = f"(c)2015 Physik Instrumente (PI) GmbH & Co. KG, {model}, EMULATED, 1.2.1.0"
         self._stage = stage
         self._seed = seed
         self._parameters: dict[int, float | str] = {
