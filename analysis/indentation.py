@@ -24,6 +24,12 @@ FEWEST = 12
 FITTED = {"fitted_work_of_adhesion_J_m2": "work_of_adhesion", "fitted_modulus_Pa": "modulus"}
 """Features of the better fit, and which of its attributes each is."""
 
+FIRST_ORDER = 0.2
+"""A correction of w and E* by more than that is none of first order."""
+
+DEPENDENT = 1e-6
+"""Directions of the unknowns that the curve shows less than that, of the one it shows most, stay as they are."""
+
 WIDEST = 7.0
 """Work of adhesion, modulus and strength are sought within this logarithm of the first guess."""
 
@@ -129,6 +135,8 @@ class ContactFit:
         ``"JKR"``, ``"DMT"`` or ``"Maugis"``.
     work_of_adhesion, modulus
         J/m^2 and contact modulus E*, Pa; with standard uncertainties from the fit's covariance.
+    rate_shift
+        What both change by, relatively, if the work of adhesion may grow with the line's speed; where that is asked.
     origin
         Separation at first touch, m.
     corner
@@ -137,6 +145,8 @@ class ContactFit:
         Cohesive strength of Maugis, Pa; ``nan`` for the others.
     misfit
         Root mean square residual, N.
+    stretches
+        Parts of the curve that lie on one side of the fit each: as many points say something of their own.
     separation, force
         The fitted curve.
     """
@@ -146,10 +156,12 @@ class ContactFit:
     work_of_adhesion_uncertainty: float
     modulus: float
     modulus_uncertainty: float
+    rate_shift: tuple[float, float]
     origin: float
     corner: float
     strength: float
     misfit: float
+    stretches: int
     separation: Array
     force: Array
 
@@ -253,11 +265,20 @@ def _cornered(model: str, place: Array, pull: Array, radius: float, logs: list[f
 
 
 def _solve(
-    model: str, place: Array, pull: Array, radius: float, logs: list[float], corner: float, origin: float
+    model: str,
+    place: Array,
+    pull: Array,
+    radius: float,
+    logs: list[float],
+    corner: float,
+    origin: float,
+    *,
+    rate: bool = False,
 ) -> ContactFit:
     """Least squares over the logarithms of w, E* (and strength), and corner and origin in micrometres.
 
-    The line begins to recede somewhere between the deepest point and that of the largest tension.
+    The line begins to recede somewhere between the deepest point and that of the largest tension. With ``rate`` w grows
+    with a power of its speed; the power is found to first order, and left out where that would not do.
     """
     from scipy.optimize import least_squares
 
@@ -272,23 +293,46 @@ def _solve(
     lowest = np.array([*(log - WIDEST for log in logs), first / 1e-6 - 1e-3, -np.inf])
     highest = np.array([*(log + WIDEST for log in logs), last / 1e-6 + 1e-3, np.inf])
     solution = least_squares(residual, start, bounds=(lowest, highest), max_nfev=200, x_scale="jac")
-    jacobian = np.asarray(solution.jac, dtype=np.float64)
-    variance = float(np.sum(solution.fun**2)) / max(1, place.size - start.size)
-    spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
-    found = solution.x
+    found, residuals = solution.x, np.asarray(solution.fun, dtype=np.float64)
+    columns, shift = np.asarray(solution.jac, dtype=np.float64), (0.0, 0.0)
+    if rate:
+        columns = np.column_stack([columns, columns[:, 0] * _faster(model, place, radius, found)])
+        moved = -np.linalg.pinv(columns) @ residuals
+        shift = (float(moved[0]), float(moved[1]))
+        if math.hypot(*shift) < FIRST_ORDER:
+            found, residuals = found + moved[:-1], residuals + columns @ moved
+    variance = float(np.sum(residuals**2)) / max(1, place.size - columns.shape[1])
+    spread = np.sqrt(np.sum(np.linalg.pinv(columns, DEPENDENT) ** 2, axis=1) * variance)
     return ContactFit(
         model=model,
         work_of_adhesion=math.exp(found[0]),
         work_of_adhesion_uncertainty=math.exp(found[0]) * float(spread[0]),
         modulus=math.exp(found[1]),
         modulus_uncertainty=math.exp(found[1]) * float(spread[1]),
+        rate_shift=shift,
         origin=float(found[-1]) * 1e-6,
         corner=float(found[-2]) * 1e-6,
         strength=math.exp(found[2]) if model == "Maugis" else math.nan,
-        misfit=float(np.sqrt(np.mean(solution.fun**2))) * scale,
+        misfit=float(np.sqrt(np.mean(residuals**2))) * scale,
+        stretches=1 + int(np.count_nonzero(np.diff(np.signbit(residuals)))),
         separation=place,
-        force=np.asarray(solution.fun * scale + pull, dtype=np.float64),
+        force=residuals * scale + pull,
     )
+
+
+def _faster(model: str, place: Array, radius: float, found: Array) -> Array:
+    """Return the logarithm of the line's speed, over that at the largest tension; while pinned, as it begins to recede.
+
+    Zero where too little of it is seen to recede.
+    """
+    corner, origin = (float(value) * 1e-6 for value in found[-2:])
+    force, contact = LAWS[model](np.minimum(origin - place, origin - corner), found[:-2], radius)
+    speed = -np.gradient(contact)
+    moving = np.flatnonzero((place > corner) & (speed > 0))
+    if moving.size < FEWEST:
+        return np.zeros(place.size)
+    logarithm = np.interp(np.arange(place.size), moving, np.log(speed[moving]))
+    return np.asarray(logarithm - logarithm[int(np.argmin(force))], dtype=np.float64)
 
 
 def _first_guess(place: Array, pull: Array, radius: float) -> tuple[float, float, float]:
@@ -313,26 +357,28 @@ def contact_models(work: Extraction) -> Details:
     """Fit JKR and DMT to the attached part of the retraction, F against z, and keep the better.
 
     At first the contact line is pinned (hysteresis), and the contact as stiff as a punch; where it begins to recede is
-    fitted too. The fit is repeated on the perturbed copies of the run. Added to the uncertainty is how far the same
-    model moves when it is fitted to the tension alone, and the spread between the models, the less the worse the other
-    fits.
+    fitted too, and how the work of adhesion grows with the line's speed: w is that at the largest tension. The fit is
+    repeated on the perturbed copies of the run. Added to the uncertainty is what that growth has changed, as the half
+    width of a rectangle, and how far off the other model is, with the odds on it: the ratio of the misfits to the power
+    of the number of stretches that lie to one side of the better fit.
 
     Maugis has one parameter more and is fitted on request only (``fit_contact``): it follows noise where the others
     suffice.
     """
     start, _ = work.retraction()
-    part, tense = slice(start, int(work.release)), slice(max(start, int(work.zero)), int(work.release))
+    part = slice(start, int(work.release))
     radius = indenter_radius(work.run)
     if work.earlier is not None:
         return _fitted_again(work, work.earlier, part, radius)
-    best, rival = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
-    narrow = fit_contact(work.separation[tense], work.force[tense], radius, models=(best.model,))[0]
-    plausible = best.misfit / rival.misfit / 12**0.5
-    for name, key in FITTED.items():
-        value, other, third = (float(getattr(fit, key)) for fit in (best, narrow, rival))
+    first, rival = fit_contact(work.separation[part], work.force[part], radius, models=("JKR", "DMT"))
+    best = _with_rate(first, work, part, radius)
+    odds = (first.misfit / rival.misfit) ** first.stretches
+    doubt = math.sqrt(odds / (1 + odds))
+    for (name, key), shift in zip(FITTED.items(), best.rate_shift, strict=True):
+        value, other = (float(getattr(fit, key)) for fit in (best, rival))
         work.set(**{name: value})
         own = float(getattr(best, f"{key}_uncertainty"))
-        work.stated[name] = math.hypot(own, (value - other) / RECTANGULAR, plausible * (value - third))
+        work.stated[name] = math.hypot(own, value * shift / RECTANGULAR, doubt * (value - other))
     words = "; ".join(
         f"{fit.model}: w = {fit.work_of_adhesion:.3g} J/m², misfit {fit.misfit * 1e3:.2g} mN" for fit in (best, rival)
     )
@@ -346,12 +392,16 @@ def _fitted_again(work: Extraction, earlier: Extraction, part: slice, radius: fl
         raise FeatureMissing(earlier.failed["contact models"])
     fits = earlier.details["contact models"]["fits"]
     assert isinstance(fits, tuple)
+    fit = _with_rate(fits[0], work, part, radius)
+    work.set(**{name: float(getattr(fit, key)) for name, key in FITTED.items()})
+    return {"decision": "as before", "fits": (fit,)}
+
+
+def _with_rate(near: ContactFit, work: Extraction, part: slice, radius: float) -> ContactFit:
+    """Fit the model of another fit, from there, with a work of adhesion that grows with the line's speed."""
     length = max(1, (part.stop - part.start) // POINTS)
     place, pull = block_means(work.separation[part], length), block_means(work.force[part], length)
     if place.size < FEWEST:
         raise FeatureMissing("the retraction holds too little to fit")
-    best = fits[0]
-    logs = [math.log(best.work_of_adhesion), math.log(best.modulus)]
-    fit = _solve(best.model, place, pull, radius, logs, best.corner, best.origin)
-    work.set(**{name: float(getattr(fit, key)) for name, key in FITTED.items()})
-    return {"decision": "as before", "fits": (fit,)}
+    logs = [math.log(near.work_of_adhesion), math.log(near.modulus)]
+    return _solve(near.model, place, pull, radius, logs, near.corner, near.origin, rate=True)

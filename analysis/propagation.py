@@ -68,7 +68,8 @@ def _systematic(work: Extraction) -> Iterator[tuple[str, Run]]:
     run, sensors = work.run, work.run.sensors
     changes: list[tuple[str, float, Callable[[float], Run]]] = [
         ("force calibration", sensors.force_gain, lambda u: replace(run, force=run.force * (1 + u))),
-        ("force linearity", sensors.force_linearity, lambda u: replace(run, force=_bent(work, u))),
+        ("force linearity", sensors.force_linearity, lambda u: replace(run, force=_bent(work, u, np.minimum))),
+        ("force linearity", sensors.force_linearity, lambda u: replace(run, force=_bent(work, u, np.maximum))),
         ("position", sensors.position, lambda u: replace(run, height=run.height * (1 + u))),
         (
             "compliance",
@@ -117,14 +118,15 @@ def _with_setting(run: Run, key: str, value: float, change: float) -> Run:
     return replace(run, settings={**run.settings, key: value + change})
 
 
-def _bent(work: Extraction, uncertainty: float) -> Array:
-    """A calibration curve that is out by ``uncertainty``, with the sign of the load.
+def _bent(work: Extraction, uncertainty: float, side: Callable[[Array, float], Array]) -> Array:
+    """A calibration out by ``uncertainty`` under tension (``np.minimum``) or compression (``np.maximum``).
 
-    It is right at zero, and out by nine tenths of that at one per cent of the cell's capacity: the smallest weight of
-    its calibration. Where no capacity is known the largest force stands for it.
+    Weights hang on one side: what the line is out by there says nothing of the other. It is right at zero, and out by
+    nine tenths at one per cent of the cell's capacity: the smallest weight of its calibration. Where no capacity is
+    known the largest force stands for it.
     """
     scale = 0.007 * (work.run.sensors.force_capacity or max(float(np.abs(work.force).max()), 1e-12))
-    return np.asarray(work.run.force + uncertainty * np.tanh(work.force / scale), dtype=np.float64)
+    return np.asarray(work.run.force + uncertainty * np.tanh(side(work.force, 0.0) / scale), dtype=np.float64)
 
 
 def _drift_excess(work: Extraction) -> float:

@@ -120,7 +120,7 @@ def detachment(work: Extraction) -> Details:
     2. The separation is the stage's height half a sample later, less the load train's stretch, compliance times force:
        the train springs back only when the contact is lost. Contacts run away before that: within the sample that is
        not seen the force is taken to fall by twice as much as in the one before, and by that much uncertain. A JKR
-       contact loses its force with its area: what would be left counts the less, the more the fall grows.
+       contact loses its force with its area: none is left.
     3. Without such a jump, or where tension is left after it: where that falls below four standard deviations of a
        20 ms mean and of the creep put back. The mean comes late by half its width, and below that limit the tension
        may go on: by as far again as it took to fall there from the limit of a single sample, if it fades no slower
@@ -175,14 +175,11 @@ def _fade(work: Extraction, begin: int) -> tuple[int, int] | None:
 
 def _held(work: Extraction, last: int) -> tuple[float, float]:
     """Return the force at the end of the contact, after the last sample in tension, and its standard uncertainty, N."""
+    if work.run.protocol == "indentation":
+        return 0.0, 0.0
     seen, fall = float(work.force[last]), float(work.force[last] - work.force[last - 1])
     left = min(seen + 2 * fall, 0.0)
-    if work.run.protocol != "indentation":
-        return left, abs(left - seen) / RECTANGULAR
-    before = float(work.force[last - 1] - work.force[last - 4]) / 3
-    growth = (fall - before - 3 * work.noise.sigma) / fall if fall > 0 else 0.0  # two deviations of that difference
-    held = left * (1 - min(max(growth, 0.0), 1.0))
-    return held, abs(held - seen) / RECTANGULAR
+    return left, abs(left - seen) / RECTANGULAR
 
 
 def _last_tense(work: Extraction, jump: ForceJump) -> int:

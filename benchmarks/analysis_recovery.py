@@ -257,9 +257,11 @@ def true_features(test: Test) -> dict[str, float]:
     zero = float(np.interp(0, -force[first : first + 2], height[first : first + 2])) if compressed.size else height[0]
     part = slice(first + 1 if compressed.size else 0, last + 1)
     start = 0.0 if compressed.size else float(force[0])
+    # A JKR contact's force vanishes with its radius: what the last knot still carries is the world's step in time.
+    end = height[last + 1] if test.run.protocol == "indentation" else height[last]
     found = {
         "pull_off_force_N": -float(force[lowest]),
-        "pull_off_distance_m": float(height[last] - zero),
+        "pull_off_distance_m": float(end - zero),
         "preload_N": float(test.rows[times < dwell.stop][:, 1].max()),
         "adhesion_energy_J": -float(np.trapezoid(np.r_[start, force[part]], np.r_[zero, height[part]])),
     }

@@ -24,7 +24,7 @@ from model.parameters import Membrane, Parameters, Substrate
 RADIUS, MODULUS, WORK = 4e-3, 2e6, 4.1
 
 
-def indentation_run(**settings: float | str) -> Run:
+def indentation_run(profile: Profile | None = None, **settings: float | str) -> Run:
     experiment = Experiment(
         rate=500.0,
         retract_speed=10e-6,
@@ -34,7 +34,7 @@ def indentation_run(**settings: float | str) -> Run:
         settle=1.5,
         settings={"indenter_radius_mm": 4.0, **settings},
     )
-    profile = Profile.jkr(WORK, RADIUS, MODULUS, 0.095)
+    profile = profile or Profile.jkr(WORK, RADIUS, MODULUS, 0.095)
     run, _ = pull_off_run(profile, experiment, Imperfections(force_noise=1e-4), sensors=Sensors(force_gain=2e-3))
     membrane = Membrane(youngs_modulus=2e6, thickness=250e-6)
     return replace(
@@ -119,6 +119,46 @@ def test_a_line_that_is_pinned_at_first_does_not_stiffen_the_modulus(share: floa
     assert best.modulus == pytest.approx(MODULUS, rel=0.01)
     assert best.work_of_adhesion == pytest.approx(WORK, rel=0.01)
     assert best.corner == pytest.approx(-corner, abs=2e-6)
+
+
+def run_with_rate(power: float) -> Run:
+    """Return a test whose work of adhesion grows with a power of the line's speed, and is ``WORK`` at F_p."""
+    profile = Profile.jkr(WORK, RADIUS, MODULUS, 0.095)
+    place, work = profile.retraction, np.full(profile.retraction.size, WORK)
+    for _ in range(8):
+        contact = np.array([jkr.jkr_contact_radius(-z, w, RADIUS, MODULUS) for z, w in zip(place, work, strict=True)])
+        place, work, contact = (values[np.isfinite(contact)] for values in (place, work, contact))
+        force = np.array([jkr.jkr_force_at(a, w, RADIUS, MODULUS) for a, w in zip(contact, work, strict=True)])
+        speed = np.maximum.accumulate(-np.gradient(contact, place))
+        work = WORK * (speed / speed[int(np.argmin(force))]) ** power
+    return indentation_run(Profile(place, force, np.zeros(place.size)))
+
+
+def test_a_work_of_adhesion_that_grows_with_the_lines_speed_leaves_the_modulus_alone() -> None:
+    analysis = analyze(run_with_rate(0.03))
+    best, _ = analysis.work.details["contact models"]["fits"]
+    assert best.modulus / (1 + best.rate_shift[1]) < 0.993 * MODULUS
+    modulus, work = (analysis.features[f"fitted_{name}"] for name in ("modulus_Pa", "work_of_adhesion_J_m2"))
+    assert modulus.value == pytest.approx(MODULUS, rel=0.005)
+    assert work.value == pytest.approx(WORK, rel=0.005)
+    assert modulus.budget["fit"] > 0.005 * modulus.value
+
+
+def test_a_model_that_does_not_fit_casts_no_doubt_on_the_one_that_does() -> None:
+    analysis = analyze(indentation_run())
+    best, rival = analysis.work.details["contact models"]["fits"]
+    assert (best.model, rival.model) == ("JKR", "DMT")
+    assert abs(rival.work_of_adhesion / best.work_of_adhesion - 1) > 0.2
+    for name in ("fitted_modulus_Pa", "fitted_work_of_adhesion_J_m2"):
+        fitted = analysis.features[name]
+        assert fitted.budget["fit"] < 0.01 * fitted.value
+
+
+def test_no_force_stretches_the_load_train_where_a_jkr_contact_ends() -> None:
+    run = indentation_run()
+    soft = replace(run, sensors=replace(run.sensors, compliance=12e-6))
+    stiff, measured = (analyze(one, uncertainties=False).features.value("pull_off_distance_m") for one in (run, soft))
+    assert measured == pytest.approx(stiff, abs=1e-9)
 
 
 def test_fit_refuses_a_curve_without_tension() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from analysis import analyze
 from analysis.coverage import CASES, coverage, deviations
+from analysis.extraction import extract
 
 FEATURES = (
     "pull_off_force_N",
@@ -58,6 +61,21 @@ def test_linearity_belongs_to_the_cell_and_not_to_the_run() -> None:
     force = features["pull_off_force_N"]
     whole = run.sensors.force_linearity * np.tanh(force.value / (0.007 * run.sensors.force_capacity))
     assert force.budget["force linearity"] == pytest.approx(whole, rel=0.05)
+
+
+def test_what_the_cell_is_out_by_under_tension_says_nothing_of_compression() -> None:
+    """The slope of E* leans on both: their parts add up in squares, not one against the other."""
+    run, _ = CASES["indentation"](3)
+    work = extract(run)
+    name = "fitted_modulus_Pa"
+    parts = []
+    for side in (np.minimum, np.maximum):
+        scale = 0.007 * run.sensors.force_capacity
+        bent = run.force + run.sensors.force_linearity * np.tanh(side(work.force, 0.0) / scale)
+        parts.append(extract(replace(run, force=bent), before=work).values[name] - work.values[name])
+    found = analyze(run).features[name].budget["force linearity"]
+    assert found == pytest.approx(np.hypot(*parts), rel=1e-6)
+    assert found < 0.9 * abs(parts[0] + parts[1])
 
 
 def test_a_fit_is_no_better_known_than_the_force_it_was_fitted_to() -> None:
