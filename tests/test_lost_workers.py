@@ -91,6 +91,9 @@ class Dead:
     def __exit__(self, *_: object) -> None:
         pass
 
+    def shutdown(self, **_: Any) -> None:
+        pass
+
     def submit(self, *_: Any) -> Future[Any]:
         future: Future[Any] = Future()
         future.set_exception(BrokenProcessPool("killed"))
