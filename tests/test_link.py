@@ -417,6 +417,7 @@ def test_a_late_answer_is_not_taken_for_that_of_a_later_stop(monkeypatch: pytest
             never.wait()
 
     killed: list[str] = []
+    monkeypatch.setattr("rig.link.ACKNOWLEDGE_S", 0.2)
     monkeypatch.setattr(Link, "_kill", lambda link, what: killed.append(what) or Answer(False, "killed", 0.2))
     with LinkServer(Slow()) as server:
         link = Link(server.address)
