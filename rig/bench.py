@@ -111,6 +111,7 @@ class CalibrationSection(Section):
 class ForceSection(Section):
     """``[force]``: load cell. ``calibration``: N per V (amplified) or N per mV/V (bridge).
 
+    ``at_rest_N`` is what the cell reads with the gripper hanging free.
     ``creep_percent`` of a compression is lost to the reading within ``creep_time_s``, and comes back as slowly; a time
     of zero says that it was never measured.
     """
@@ -125,6 +126,7 @@ class ForceSection(Section):
     excitation_V: Annotated[float, Field(gt=0, le=10)] = 2.5
     bridge_ohm: Annotated[float, Field(gt=0)] = 350.0
     compression_positive: bool = True
+    at_rest_N: float = 0.0
     compliance_um_per_N: Annotated[float, Field(ge=0)] = 0.0
     compliance_uncertainty_um_per_N: Annotated[float, Field(ge=0)] = 0.0
     creep_percent: Annotated[float, Field(ge=0, le=30)] = 0.0

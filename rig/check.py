@@ -39,6 +39,9 @@ and the stage should be (100 N/mm; the emulated one gives 12 um/N). Whoever know
 TOUCH = 0.1
 """Change of force that ends the way to the starting height, in capacities: nothing should be in that way."""
 
+AT_REST = 0.02
+"""How far a tare may lie from the force at rest, in capacities: drift and creep, no contact worth the name."""
+
 TARE_FRAMES = 4
 """Frames a tare needs at least, or it could not tell noise and drift."""
 
@@ -108,7 +111,7 @@ def _material(scene: Scene, bench: Bench) -> list[str]:
 
 def _forces(scene: Scene, bench: Bench) -> list[str]:
     preload = getattr(scene.protocol, "preload_N", 0.0)
-    limit = min(bench.limits.compression_N, bench.force.capacity_N)
+    limit = min(bench.limits.compression_N, bench.force.capacity_N) - pressing_at_rest(bench)
     if preload * STOPPING_MARGIN <= limit:
         return []
     return [
@@ -143,7 +146,7 @@ def _resolution(scene: Scene, bench: Bench) -> list[str]:
 
 def _tension(scene: Scene, bench: Bench) -> list[str]:
     """Forces that are known before: hung weights, and the soft gripper's from the published table."""
-    limit = min(bench.limits.tension_N, bench.force.capacity_N)
+    limit = min(bench.limits.tension_N, bench.force.capacity_N) - max(0.0, -bench.force.at_rest_N)
     protocol = scene.protocol
     if isinstance(protocol, DeadWeightsSection):
         heaviest = max(protocol.masses_g) * 1e-3 * protocol.gravity_m_s2
@@ -254,7 +257,7 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
             "force.compliance_um_per_N of the bench is 0: nobody knows how fast the force rises on contact; "
             "run the scene `compliance` and enter its result"
         ]
-    limits, preload = bench.limits, protocol.preload_N
+    limits, preload = bench.limits, protocol.preload_N + pressing_at_rest(bench)
     reaction = reaction_s(bench)
     key = (
         "compression_N" if limits.compression_N >= limits.tension_N else "tension_N"
@@ -303,6 +306,11 @@ def _stiffness(bench: Bench) -> str:
     return f"its force changes by {words}" if known else f"its compliance is unknown, {words} is assumed"
 
 
+def pressing_at_rest(bench: Bench) -> float:
+    """Return what the cell reads of compression with the gripper free, N."""
+    return max(0.0, bench.force.at_rest_N)
+
+
 def reaction_s(bench: Bench) -> float:
     """Return the longest time from a sample that passes a limit to the stop byte, s: its frame and the reaction."""
     return bench.daq.frame_s + REACTION_S
@@ -320,6 +328,6 @@ def parking(bench: Bench) -> Parking:
     start = bench.stage.start_mm
     return Parking(
         start=None if start is None else start * 1e-3,
-        speed=min(PARK_SPEED, room_um(bench, touch) * 1e-6 / reaction_s(bench)),
+        speed=min(PARK_SPEED, room_um(bench, touch + abs(bench.force.at_rest_N)) * 1e-6 / reaction_s(bench)),
         touch=touch,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drivers.interfaces import Pump, Stage
 from rig.bench import Bench
-from rig.check import room_um
+from rig.check import AT_REST, room_um
 from rig.scene import (
     ComplianceSection,
     ContactSection,
@@ -30,6 +30,8 @@ def apparatus_of(bench: Bench, stage: Stage, pump: Pump | None, tell: Teller) ->
         look_ahead=bench.limits.look_ahead_um * 1e-6,
         frame=bench.daq.frame_s,
         room=lambda force: room_um(bench, force) * 1e-6,
+        at_rest=bench.force.at_rest_N,
+        at_rest_within=AT_REST * bench.force.capacity_N,
     )
 
 

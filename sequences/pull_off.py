@@ -11,9 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from sequences.errors import StepFailed
-from sequences.frame import Frame
+from sequences.frame import Array, Frame
 from sequences.pressurize import Chamber, Pressurizer
 from sequences.step import Apparatus, Motion, Step, Steps, rest, stopping_on_failure, travel
+
+FEWEST_VALUES = 3
+"""Different values in a tare: less is no sensor, whose noise every DAQ shows."""
+
+PRESS_BY_HAND = "press the load cell by hand, `rig doctor` must show it; if not, look at its amplifier and wires"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +80,12 @@ class PullOff:
 
     def _tare(self, frame: Frame) -> Steps:
         self._start_height = frame.stage.position
-        blocks: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
+        blocks: list[Array] = []
         samples = 0
         while samples < self._settings.tare * frame.rate:
             frame = yield
+            if frame.stage.moving:
+                raise StepFailed("tare", "the stage is moving", "look at its controller, then run again")
             blocks.append(frame.force)
             samples += frame.force.size
             self._apparatus.tell.progress(samples / frame.rate, self._settings.tare, "s")
@@ -93,8 +100,26 @@ class PullOff:
                 f"contact is at {self._settings.contact_force * 1e3:g} mN",
                 "let the load cell warm up, keep the gripper clear of the sample, or raise contact_force_mN",
             )
+        self._insist_on_a_free_gripper(force)
         self._apparatus.tell.note(f"tare {self._zero:+.5f} N, noise of a frame's mean {self._noise * 1e3:.3f} mN")
         return frame
+
+    def _insist_on_a_free_gripper(self, force: Array) -> None:
+        """Refuse a sensor that cannot be true, and a contact that the tare would hide."""
+        if np.unique(force).size < FEWEST_VALUES:
+            raise StepFailed(
+                "tare",
+                f"the force does not scatter: all of its {force.size} samples are {self._zero:+.4f} N",
+                PRESS_BY_HAND,
+            )
+        rest, within = self._apparatus.at_rest, self._apparatus.at_rest_within
+        if abs(self._zero - rest) > within:
+            raise StepFailed(
+                "tare",
+                f"the force at rest is {self._zero:+.3f} N, {rest:+g} N within {within:.2g} N expected",
+                "drive the stage clear: the gripper is in contact; if it surely hangs free, enter what `rig doctor` "
+                "shows as at_rest_N of the bench",
+            )
 
     def _approach(self, frame: Frame) -> Steps:
         lowest = self._apparatus.stage.travel[0]

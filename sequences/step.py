@@ -58,6 +58,8 @@ class Apparatus:
         Usual length of a frame, s.
     room
         How far the stage may go on from a force (N, a magnitude) against something rigid, m.
+    at_rest, at_rest_within
+        What the load cell reads with the gripper free, and how far from it a tare may lie, N.
     """
 
     stage: Stage
@@ -66,6 +68,8 @@ class Apparatus:
     look_ahead: float = 50e-6
     frame: float = 20e-3
     room: Callable[[float], float] = lambda force: math.inf
+    at_rest: float = 0.0
+    at_rest_within: float = math.inf
 
     def ahead(self, frame: Frame) -> float:
         """Return how far ahead of its position the stage may be commanded, m: the cell outlives this program."""

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 from test_check import bench_with, said
 
+from drivers.emulated.direct import DirectDaq, DirectStage
 from rig import emulation
 from rig.observe import Observer
 from rig.session import run_scene
@@ -67,3 +68,74 @@ def test_the_approach_is_slow_enough_for_a_force_of_either_sign():
     bench = bench.model_copy(update={"daq": bench.daq.model_copy(update={"frame_ms": 60.0})})
     told = said(bench, "sphere-60mm-vented", approach_speed_um_s=60.0)
     assert "approach_speed_um_s = 60 can overload the load cell" in told
+
+
+def left_at(height):
+    """Return the change of a bench whose stage was left at a height, mm."""
+    return ("start_mm = 22.0", f"start_mm = {height}\nleft_on = true")
+
+
+def resting_at(force):
+    """Return the change of a bench whose load cell reads so much more, N."""
+    return ("intercept = 0.0", f"intercept = {force}")
+
+
+def stated(force):
+    """Return the change of a bench that says what its load cell reads at rest, N."""
+    return ('readout = "amplified"', f'readout = "amplified"\nat_rest_N = {force}')
+
+
+def test_a_tare_in_contact_is_refused_where_the_stage_is(request_for, truth):
+    ending = run(request_for(), truth, bench_with(left_at(18.8)))
+    pressed = truth.most
+    assert pressed > 0.2
+    assert ending.exit_code == 4
+    assert "step tare: the force at rest is +3." in ending.reason
+    assert "drive the stage clear" in ending.reason
+    assert truth.lowest == pytest.approx(18.8e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("rest", [3.6, 0.5, -0.5])
+def test_a_force_at_rest_that_nobody_has_stated_is_refused(request_for, truth, rest):
+    ending = run(request_for(), truth, bench_with(resting_at(rest)))
+    assert ending.exit_code == 4
+    assert f"the force at rest is {rest + 0.019:+.3f}" in ending.reason
+    assert "at_rest_N" in ending.reason
+    assert truth.most < 0.01
+
+
+@pytest.mark.parametrize("rest", [0.5, -0.5])
+def test_a_stated_force_at_rest_is_tared_away(request_for, truth, rest):
+    ending = run(request_for(), truth, bench_with(resting_at(rest), stated(rest)))
+    assert ending.exit_code == 0, ending.reason
+    assert 0.29 < truth.most < 0.4
+
+
+def test_the_force_at_rest_counts_among_what_the_cell_carries():
+    assert "at most 1.93 N" in said(bench_with(stated(1.5)), "sphere-60mm-vented", preload_N=2.0)
+    assert not said(bench_with(stated(-1.5)), "sphere-60mm-vented", preload_N=1.7, approach_speed_um_s=50.0)
+    assert "look_ahead_um = 50" in said(bench_with(stated(1.5)), "sphere-60mm-vented", preload_N=1.0)
+    assert "the tension limit is 2.9 N" in said(bench_with(stated(-1.5)), "soft-flat")
+
+
+def test_a_tare_of_a_stage_that_moves_is_refused(request_for, truth, monkeypatch):
+    real = DirectStage.status
+    monkeypatch.setattr(DirectStage, "status", lambda stage: dataclasses.replace(real(stage), moving=True))
+    ending = run(request_for(referenced=True), truth)
+    assert ending.exit_code == 4
+    assert "step tare: the stage is moving" in ending.reason
+
+
+def test_a_force_that_does_not_scatter_is_refused(request_for, truth, monkeypatch):
+    real = DirectDaq.read
+
+    def frozen(daq, samples):
+        volts = real(daq, samples)
+        volts[0] = 0.0
+        return volts
+
+    monkeypatch.setattr(DirectDaq, "read", frozen)
+    ending = run(request_for(), truth)
+    assert ending.exit_code == 4
+    assert "step tare: the force does not scatter" in ending.reason
+    assert truth.most < 0.01
