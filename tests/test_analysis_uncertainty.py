@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from analysis import analyze
 from analysis.coverage import CASES, coverage, deviations
 from analysis.extraction import extract
+from analysis.preparation import fit_baseline
+from analysis.propagation import _drift_excess
 
 FEATURES = (
     "pull_off_force_N",
@@ -84,3 +87,25 @@ def test_a_fit_is_no_better_known_than_the_force_it_was_fitted_to() -> None:
     force, fitted = features["work_of_adhesion_J_m2"], features["fitted_work_of_adhesion_J_m2"]
     for source in ("force linearity", "drift", "creep"):
         assert fitted.budget[source] == pytest.approx(force.budget[source], rel=0.6), source
+
+
+@pytest.mark.parametrize("gap", [40, 160, 300])
+def test_a_wander_as_slow_as_the_contact_is_long_is_covered(gap: int) -> None:
+    """The zero of force wanders between two short force-free parts, in waves of 200 to 1800 s."""
+    generator, rate, scores = np.random.default_rng(1), 50, []
+    for _ in range(100):
+        before, after = (round(rate * generator.uniform(5, 10)) for _ in range(2))
+        count = before + gap * rate + after
+        time = np.arange(count) / rate
+        zero = 4e-6 * generator.normal() * time
+        for period in (197.0, 611.0, 1789.0):
+            phase = generator.uniform(0, 2 * np.pi)
+            zero = zero + 4e-4 * generator.normal() * np.sin(2 * np.pi * time / period + phase)
+        windows = [(0, before), (count - after, count)]
+        recorded = zero + generator.normal(0, 6e-5, count)
+        baseline = fit_baseline(recorded, windows)
+        line = baseline(np.arange(count))
+        work = SimpleNamespace(details={"tare": {"windows": windows}}, force=recorded - line, baseline=baseline)
+        inside = generator.integers(before, count - after, 8)
+        scores += list((zero - line)[inside] / _drift_excess(work))  # type: ignore[arg-type]
+    assert 0.4 < np.sqrt(np.mean(np.square(scores))) < 1.2
