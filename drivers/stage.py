@@ -9,7 +9,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from drivers.errors import (
@@ -57,6 +57,13 @@ REMEDIES = {
 }
 CABLES = "check power and cable of the controller, and its baud rate; then connect again"
 LOOK_UP = "look the code up in the controller's manual, then stop and connect again"
+
+SURPRISE, ASTRAY = 5e-6, 20e-6
+"""m. A position so much further than the stage can have come is asked again; one so far off its way is not believed."""
+KEPT = 0.1
+"""Relative difference at which a speed read back still counts as the one sent: the controller may round."""
+SAME_PLACE, SAME_SPEED = 1e-3, 1e-3
+"""mm, mm/s: what a target and a speed may differ from those sent, beyond that."""
 GARBLED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, SystemError)
 """What pipython raises on replies it cannot parse."""
 
@@ -128,6 +135,9 @@ class PIStage:
         self._limits_idle = 0
         self._limits_seen = 0
         self._limits_accepted = 0
+        self._last: tuple[float, float] | None = None
+        self._targets: list[float] = []
+        self._speed = self._fastest = 0.0
         with opening(DEVICE, connection):
             self._gateway = Gateway(connection, baud, reply_timeout)
         self._messages: Any = GCSMessages(self._gateway)
@@ -167,6 +177,7 @@ class PIStage:
         self.servo(True)
         with self._exchange("start the reference move"), self._unless_stopped():
             self._was_referenced = False
+            self._targets.clear()
             self._fault = NO_ERROR
             self._gcs.RON(self._axis, 1)
             if not self._gcs.qLIM()[self._axis]:
@@ -192,16 +203,22 @@ class PIStage:
             The controller stopped the motion by itself, lost its servo or restarted.
         CommandRefused
             Another error is pending in the controller.
+        BadReply
+            A reply makes no sense, or the position lies off the way, also when asked again.
         """
+        last, self._last = self._last, None
         with self._exchange("poll the status", check=False):
             sent = self._clock()
             word = self._status_word()
-            position = self._direction * self._value(self._gcs.qPOS())
+            position = self._ask_position(last if word & SERVO_ON and not word & REFERENCING else None)
             received = self._clock()
             self._position = position
             error = self._gcs.qERR() if word & ERROR else NO_ERROR
             limits = (word & LIMITS) ^ self._limits_idle
             self._check_health(word, limits, error)
+        self._targets, self._fastest = self._targets[-1:], self._speed
+        if not word & REFERENCING:
+            self._last = sent, position
         return StageStatus(
             sent=sent,
             received=received,
@@ -220,6 +237,8 @@ class PIStage:
             raise OutOfRange(DEVICE, f"speed {speed!r} m/s is not a positive number", "choose a speed above 0")
         with self._exchange(f"set the speed to {speed * 1e3:g} mm/s"):
             self._gcs.VEL(self._axis, speed * 1e3)
+            self._insist("speed", speed * 1e3, self._gcs.qVEL, KEPT * speed * 1e3 + SAME_SPEED)
+            self._fastest, self._speed = max(self._fastest, speed), speed
 
     def move_to(self, position: float) -> None:
         """Start or redirect a move to ``position`` (m, within ``travel``, or on the way back to it).
@@ -236,7 +255,9 @@ class PIStage:
         with self._exchange(f"move to {position * 1e3:.6g} mm"), self._unless_stopped():
             self._limits_accepted = self._limits_seen
             self._fault = NO_ERROR
+            self._targets.append(position)
             self._gcs.MOV(self._axis, position / self._direction)
+            self._insist("target", position / self._direction, self._gcs.qMOV, SAME_PLACE)
 
     def stop(self) -> None:
         """Halt with the controller's deceleration and clear the 'stopped' error it leaves.
@@ -255,12 +276,20 @@ class PIStage:
         try:
             with self._exchange("confirm the halt", check=False):
                 self._stop_pressed = False
-                self._read_errors_away()
+                self._insist_on_halt()
         except DeviceError:
             if pressed:
                 self._stop_pressed = True
             self._send_urgent(STOP_EVERYTHING)
             raise
+
+    def _insist_on_halt(self) -> None:
+        """A halt that has arrived leaves its error code; without it the stop byte is sent after it."""
+        if STOPPED in self._read_errors_away():
+            return
+        self._send_urgent(STOP_EVERYTHING)
+        if STOPPED not in self._read_errors_away() and self._status_word() & (MOVING | REFERENCING):
+            raise MotionFault(DEVICE, "moves on though it was told twice to stop", "switch the controller off by hand")
 
     def emergency_stop(self) -> None:
         """Write the stop byte past every lock and queue, from any thread.
@@ -324,6 +353,34 @@ class PIStage:
         # Both switches cannot be pressed at once: then their signals are active low.
         self._limits_idle = LIMITS if word & LIMITS == LIMITS else 0
         self._limits_seen = self._limits_accepted = (word & LIMITS) ^ self._limits_idle
+
+    def _ask_position(self, last: tuple[float, float] | None) -> float:
+        """Ask where the stage is, m; ``last`` is when (s) and where (m) it was, if it can be held against that.
+
+        A number that has lost a digit on the wire is a number still. What comes as a surprise is asked again; then no
+        time counts, which a busy computer may take, but the way: from the last position to what was commanded since.
+        """
+        position = self._direction * self._value(self._gcs.qPOS())
+        if last is None or abs(position - last[1]) <= self._fastest * (self._clock() - last[0]) + SURPRISE:
+            return position
+        position = self._direction * self._value(self._gcs.qPOS())
+        way = (last[1], *self._targets)
+        if self._targets and not min(way) - ASTRAY <= position <= max(way) + ASTRAY:
+            raise ValueError(
+                f"it says {position * 1e3:.4f} mm, but was at {last[1] * 1e3:.4f} mm and was sent to "
+                f"{self._targets[-1] * 1e3:.4f} mm"
+            )
+        return position
+
+    def _insist(self, name: str, sent: float, ask: Callable[[], dict[str, Any]], tolerance: float) -> None:
+        """Read a setting back: a command that has lost a digit on the wire is a command still."""
+        self._messages.errcheck = False
+        for _ in range(2):
+            kept = self._value(ask())
+            if abs(kept - sent) <= tolerance:
+                return
+        self._send_urgent(STOP_EVERYTHING)
+        raise ValueError(f"the {name} is {kept:.7g} after {sent:.7g} was sent")
 
     def _status_word(self) -> int:
         word = int(self._gcs.GetStatus())
@@ -410,16 +467,16 @@ class PIStage:
         except OSError as error:
             raise NotConnected(DEVICE, f"the stop could not be sent to {self._connection}: {error}", CABLES) from error
 
-    def _read_errors_away(self) -> None:
-        """Empty the error latch; a motion error found there is kept for ``status``."""
+    def _read_errors_away(self) -> list[int]:
+        """Empty the error latch and return what was in it; a motion error found there is kept for ``status``."""
         if self._fault == STOPPED:
             self._fault = NO_ERROR
-        for _ in range(3):
-            error = self._gcs.qERR()
-            if error == NO_ERROR:
-                return
+        found: list[int] = []
+        while len(found) < 3 and (error := self._gcs.qERR()) != NO_ERROR:
+            found.append(error)
             if error in MOTION_ERRORS:
                 self._fault = error
+        return found
 
     @contextlib.contextmanager
     def _exchange(self, purpose: str, *, check: bool = True) -> Iterator[None]:

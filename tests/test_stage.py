@@ -493,7 +493,7 @@ def test_nonsense_in_operation_is_a_device_error_or_a_finite_position(replies, c
 @settings(deadline=None)
 @given(st.floats())
 def test_no_float_leaves_the_travel(position):
-    stage = connect([*GOOD_START, b"", b"0\n"])
+    stage = connect([*GOOD_START, b"", b"0\n", f"1={position * 1e3:.7f}\n".encode()])
     if 0 <= position <= 0.052:
         stage.move_to(position)
     else:

@@ -143,21 +143,36 @@ def test_inverted_axis_turns_position_travel_and_switches_round(talk):
 
 
 def test_inverted_axis_moves_the_other_way(talk):
-    talk([(b"MOV 1 20\n", b""), (b"ERR?\n", b"0\n")], lambda stage: stage.move_to(-0.020), inverted=True)
+    exchanges = [(b"MOV 1 20\n", b""), (b"ERR?\n", b"0\n"), (b"MOV?\n", b"1=20.0000000\n")]
+    talk(exchanges, lambda stage: stage.move_to(-0.020), inverted=True)
 
 
 @pytest.mark.parametrize(
     ("action", "sent"),
     [
-        (lambda stage: stage.move_to(0.0123), b"MOV 1 12.3\n"),
-        (lambda stage: stage.move_to(0.052), b"MOV 1 52\n"),
-        (lambda stage: stage.set_speed(10e-6), b"VEL 1 0.01\n"),
         (lambda stage: stage.servo(True), b"SVO 1 1\n"),
         (lambda stage: stage.servo(False), b"SVO 1 0\n"),
     ],
 )
 def test_set_commands_ask_for_the_error(talk, action, sent):
     talk([(sent, b""), (b"ERR?\n", b"0\n")], action)
+
+
+@pytest.mark.parametrize(
+    ("action", "sent", "kept"),
+    [
+        (lambda stage: stage.move_to(0.0123), b"MOV 1 12.3\n", b"1=12.3000000\n"),
+        (lambda stage: stage.move_to(0.052), b"MOV 1 52\n", b"1=52.0000000\n"),
+        (lambda stage: stage.set_speed(10e-6), b"VEL 1 0.01\n", b"1=0.0100000\n"),
+    ],
+)
+def test_targets_and_speeds_are_read_back(talk, action, sent, kept):
+    question = sent[:3] + b"?\n"
+    talk([(sent, b""), (b"ERR?\n", b"0\n"), (question, kept)], action)
+    garbled = kept.replace(b".", b"")
+    talk([(sent, b""), (b"ERR?\n", b"0\n"), (question, garbled), (question, kept)], action)
+    with pytest.raises(BadReply, match=r"after [\d.]+ was sent"):
+        talk([(sent, b""), (b"ERR?\n", b"0\n"), (question, b"1=1.0\n"), (question, b"1=1.0\n"), (b"\x18", b"")], action)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +213,8 @@ def test_emergency_stop_is_one_byte_and_blocks_moves_until_acknowledged(talk):
         stage.move_to(0.001)
 
     halt = [(b"HLT 1\n", b""), (b"ERR?\n", b"10\n"), (b"ERR?\n", b"0\n")]
-    talk([(b"\x18", b""), *halt, (b"MOV 1 1\n", b""), (b"ERR?\n", b"0\n")], press)
+    move = [(b"MOV 1 1\n", b""), (b"ERR?\n", b"0\n"), (b"MOV?\n", b"1=1.0000000\n")]
+    talk([(b"\x18", b""), *halt, *move], press)
 
 
 def test_reference_goes_to_the_limit_away_from_the_sample(talk):
