@@ -13,6 +13,12 @@ from analysis.extraction import CONTACT_TESTS, SMOOTHING, Details, Extraction, e
 from analysis.numerics import RECTANGULAR, Array, ForceJump, LocalFit, find_jumps, fit_around, fit_window, running_mean
 from analysis.preparation import require_adhesion
 
+RUN_AWAY = 0.1
+"""Before detachment the pressure falls faster than its sensor tells, s."""
+
+SETTLING = 0.5
+"""After it the membrane comes to rest, s."""
+
 
 @extraction_step(
     "zero crossing",
@@ -346,11 +352,17 @@ def pressure(work: Extraction) -> Details:
     after=("pressure",),
     gives={
         "pump_work_J": "work of the pump on the gas while P_0 is set, p dV",
-        "gas_work_J": "work of the gas on the membrane in the retraction, p dV",
+        "gas_work_J": "work of the gas on the membrane in the retraction, up to 0.1 s before detachment, p dV",
     },
 )
 def gas_work(work: Extraction) -> Details:
-    """Integrate P_a dV with the volume from Boyle's law and V_0: V = (P_atm + P_0) V_0 / (P_atm + P_a).
+    """Integrate P_a dV with the volume from Boyle's law: V = P_atm V_0 n / (P_atm + P_a).
+
+    1. The amount of gas n is one at rest, where it fills V_0. It leaks, by P_a / (P_atm tau) in a second: tau is read
+       off the pressure of the free membrane, from half a second after detachment on, where that is more than twice
+       the uncertainty of the sensor's zero.
+    2. The last 0.1 s before detachment are left out: there the membrane runs away within milliseconds, and the line to
+       the sensor shows the pressure late.
 
     The pump's part uses the recorded pump volume where there is one, and Boyle's law with V_0 otherwise.
     """
@@ -359,21 +371,42 @@ def gas_work(work: Extraction) -> Details:
         raise FeatureMissing("without parameters the chamber volume is unknown")
     atmosphere, volume = run.parameters.gas.atmospheric_pressure, run.parameters.gripper.chamber_volume
     reason = "the run has no pressurize step"
+    width = work.samples(SMOOTHING, least=1)
     if work.windows.pressurize is not None:
         part = slice(*work.windows.pressurize)
         if run.pump_volume is not None:
             work.set(pump_work_J=float(np.trapezoid(run.pressure[part], run.pump_volume[part])))
         else:
-            width = work.samples(SMOOTHING, least=1)
             gas = running_mean(run.pressure[part], width)
             work.set(pump_work_J=float(np.trapezoid(gas, volume * (gas - gas[0]) / (atmosphere + gas))))
     else:
         work.missing["pump_work_J"] = reason
     start, stop = work.retraction()
-    last = stop - 1 if np.isnan(work.release) else int(work.release)
-    gas = running_mean(run.pressure[start : last + 1], work.samples(SMOOTHING, least=1))
-    work.set(gas_work_J=float(np.trapezoid(gas, volume * (atmosphere + gas[0]) / (atmosphere + gas))))
-    return {"decision": "pump volume recorded" if run.pump_volume is not None else "volume from Boyle's law"}
+    last = (stop if np.isnan(work.release) else int(work.release)) - work.samples(RUN_AWAY)
+    if last <= start:
+        raise FeatureMissing("the contact is lost at the start of the retraction")
+    gas = running_mean(run.pressure[start:last], width)
+    leak = _leak(work, run.pressure)
+    amount = 1 - leak * np.cumsum(gas) / (run.rate * atmosphere)
+    work.set(gas_work_J=float(np.trapezoid(gas, volume * atmosphere * amount / (atmosphere + gas))))
+    words = "pump volume recorded" if run.pump_volume is not None else "volume from Boyle's law"
+    return {"decision": words + (f"; leaks within {1 / leak:.0f} s" if leak else "; no leak seen")}
+
+
+def _leak(work: Extraction, pressure: Array) -> float:
+    """Rate at which the free membrane's pressure nears the room's after detachment, over that pressure, 1/s.
+
+    Zero where the pressure is too small beside the uncertainty of the sensor's zero to tell.
+    """
+    first, (_, stop) = work.release, work.retraction()
+    if np.isnan(first) or stop - first < work.samples(2 * SETTLING):
+        return 0.0
+    tail = pressure[int(first) + work.samples(SETTLING) : stop]
+    mean = float(tail.mean())
+    if abs(mean) <= 2 * work.run.sensors.pressure_offset:
+        return 0.0
+    slope = float(np.polynomial.Polynomial.fit(np.arange(tail.size), tail, 1).deriv()(0.0)) * work.run.rate
+    return max(0.0, -slope / mean)
 
 
 @extraction_step(

@@ -185,6 +185,30 @@ def test_gas_and_pump_work_follow_boyle() -> None:
     assert from_gas_law > 0
 
 
+@pytest.mark.parametrize("leak", [0.0, 1 / 3000])
+def test_the_gas_leaks_and_the_end_is_not_seen(leak: float) -> None:
+    """The membrane draws the gas out and gives it back within a sample; the line to the sensor lags by 50 ms."""
+    run, _ = quiet_run(experiment={"retract_speed": 10e-6})
+    retract = run.step("retract")
+    assert retract is not None
+    released = retract.stop
+    atmosphere, rest, interval = SCENE.gas.atmospheric_pressure, SCENE.gripper.chamber_volume, 1 / run.rate
+    volume = np.full(run.force.size, 1.015 * rest)
+    volume[retract.start : released] += np.linspace(0, 0.02 * rest, released - retract.start)
+    pressure, sensed, amount = np.empty(volume.size), np.empty(volume.size), 1.0
+    for index, size in enumerate(volume):
+        pressure[index] = atmosphere * (amount * rest / size - 1)
+        sensed[index] = sensed[index - 1] + (pressure[index] - sensed[index - 1]) * interval / 0.05 if index else -1500
+        if index > retract.start:
+            amount -= pressure[index] / atmosphere * leak * interval
+    part = slice(retract.start, released - round(0.1 * run.rate))
+    true = float(np.trapezoid(pressure[part], volume[part]))
+    noise = np.random.default_rng(0).normal(0, 3.0, volume.size)
+    work = analyze(replace(run, pressure=sensed + noise)).features["gas_work_J"]
+    assert work.value == pytest.approx(true, rel=0.01)
+    assert abs(work.value - true) < 3 * work.uncertainty
+
+
 def test_without_pressure_only_pressure_is_missing() -> None:
     run = replace(quiet_run()[0], pressure=None)
     features = analyze(run, uncertainties=False).features
