@@ -23,6 +23,7 @@ OVERLOAD = 1.2
 class StageSection(Section):
     """``[stage]``: PI controller with a linear stage.
 
+    ``lowest_contact_mm`` is where an approach without contact ends, ``minimum_mm`` unless stated.
     ``left_on`` is for an emulated one: it has kept its reference and stands at ``start_mm`` (a real one is asked).
     """
 
@@ -33,6 +34,7 @@ class StageSection(Section):
     inverted: bool = False
     minimum_mm: float
     maximum_mm: float
+    lowest_contact_mm: float | None = None
     start_mm: float | None = None
     reference_on_start: bool = False
     left_on: bool = False
@@ -47,7 +49,18 @@ class StageSection(Section):
                 f"start_mm = {self.start_mm:g} must lie within minimum_mm = {self.minimum_mm:g} and "
                 f"maximum_mm = {self.maximum_mm:g}"
             )
+        highest = self.maximum_mm if self.start_mm is None else self.start_mm
+        if self.lowest_contact_mm is not None and not self.minimum_mm <= self.lowest_contact_mm < highest:
+            raise ValueError(
+                f"lowest_contact_mm = {self.lowest_contact_mm:g} must lie within minimum_mm = {self.minimum_mm:g} and "
+                f"where the approach begins, {highest:g}"
+            )
         return self
+
+    @property
+    def lowest_m(self) -> float:
+        """Return where an approach without contact ends, m."""
+        return (self.minimum_mm if self.lowest_contact_mm is None else self.lowest_contact_mm) * 1e-3
 
     @rule
     def _was_left_on_somewhere(self) -> StageSection:

@@ -30,6 +30,7 @@ def apparatus_of(bench: Bench, stage: Stage, pump: Pump | None, tell: Teller) ->
         look_ahead=bench.limits.look_ahead_um * 1e-6,
         frame=bench.daq.frame_s,
         room=lambda force: room_um(bench, force) * 1e-6,
+        lowest_contact=bench.stage.lowest_m,
         at_rest=bench.force.at_rest_N,
         at_rest_within=AT_REST * bench.force.capacity_N,
     )

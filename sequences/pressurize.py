@@ -44,7 +44,7 @@ class Pressurizer:
         self._chamber = chamber
         self._tolerance = tolerance
         self._step = step
-        self._goal = 0.0
+        self._goal = self._wanted = 0.0
 
     def bring_to(self, goal: float, frame: Frame) -> Steps:
         """Bring the chamber to ``goal`` (Pa gauge)."""
@@ -58,6 +58,7 @@ class Pressurizer:
                 self._apparatus.tell.note(f"P_0 reached: {pressure / 1e3:+.3f} kPa")
                 return frame
             before = pressure
+            self._wanted = goal - pressure
             after = self._chamber.atmospheric_pressure + goal
             frame = yield from self.dispense(self._chamber.volume * (goal - pressure) / after, frame)
         raise StepFailed(
@@ -74,6 +75,20 @@ class Pressurizer:
                 self._step,
                 f"P_a has changed by {found / 1e3:+.3f} kPa where the stroke should make {wanted / 1e3:+.3f} kPa",
                 "close the vent, check tubing, syringe and the pressure sensor's wires; then chamber_volume_ml",
+            )
+
+    def _insist_on_volume(self, frame: Frame) -> None:
+        """Stop a stroke that makes far more pressure than it should."""
+        if frame.pressure is None or self._wanted == 0.0:
+            return
+        pressure = float(frame.pressure.mean())
+        beyond = (pressure - self._goal) * np.sign(self._wanted)
+        if beyond > max(LARGE, abs(self._wanted) / 2):
+            raise StepFailed(
+                self._step,
+                f"P_a has come to {pressure / 1e3:+.3f} kPa, {self._goal / 1e3:+g} kPa wanted: the chamber is smaller "
+                f"than chamber_volume_ml = {self._chamber.volume * 1e6:g}",
+                "open the vent, correct chamber_volume_ml (`rig run volume` measures it) or the syringe diameter",
             )
 
     def dispense(self, volume: float, frame: Frame) -> Steps:
@@ -100,6 +115,7 @@ class Pressurizer:
         while frame.pump is before or frame.pump is None or frame.pump.state in _RUNNING:
             frame = yield
             self._show(frame)
+            self._insist_on_volume(frame)
             left -= frame.force.size
             if frame.resumed:
                 before, held = frame.pump, True  # that poll may be older than the stop

@@ -122,15 +122,16 @@ class PullOff:
             )
 
     def _approach(self, frame: Frame) -> Steps:
-        lowest = self._apparatus.stage.travel[0]
+        lowest = max(self._apparatus.stage.travel[0], self._apparatus.lowest_contact)
         motion = Motion(self._apparatus, lowest, self._settings.approach_speed)
         with stopping_on_failure(self._apparatus.stage):
             while abs(self._force(frame)) < self._settings.contact_force:
-                if motion.arrived(frame):
+                if frame.stage.position < lowest or motion.arrived(frame):
                     raise StepFailed(
                         "approach",
                         f"no contact down to {lowest * 1e3:.3f} mm",
-                        "raise the sample, or lower minimum_mm of the stage if the path is clear",
+                        f"{PRESS_BY_HAND}; if it does, look whether the gripper is above the sample: raise the sample, "
+                        "or correct lowest_contact_mm of the bench",
                     )
                 motion.extend(frame)
                 frame = yield
@@ -156,7 +157,7 @@ class PullOff:
                     raise StepFailed(
                         "preload",
                         f"{self._force(frame):.3f} of {goal:g} N at the lowest height allowed",
-                        "raise the sample or lower minimum_mm of the stage",
+                        f"{PRESS_BY_HAND}; if it does, raise the sample",
                     )
                 motion.change_speed(self._preload_speed(last, frame))
                 motion.extend(frame)

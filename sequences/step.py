@@ -58,6 +58,8 @@ class Apparatus:
         Usual length of a frame, s.
     room
         How far the stage may go on from a force (N, a magnitude) against something rigid, m.
+    lowest_contact
+        Where the approach ends without contact, m.
     at_rest, at_rest_within
         What the load cell reads with the gripper free, and how far from it a tare may lie, N.
     """
@@ -68,6 +70,7 @@ class Apparatus:
     look_ahead: float = 50e-6
     frame: float = 20e-3
     room: Callable[[float], float] = lambda force: math.inf
+    lowest_contact: float = -math.inf
     at_rest: float = 0.0
     at_rest_within: float = math.inf
 

@@ -8,23 +8,25 @@ import pytest
 from test_check import bench_with, said
 
 from drivers.emulated.direct import DirectDaq, DirectStage
+from drivers.emulated.faults import Fault, Faults
 from rig import emulation
+from rig.errors import FileError
 from rig.observe import Observer
+from rig.recording import load_recording
 from rig.session import run_scene
 
 
 class Truth(Observer):
-    """Keeps the extremes of the plant's true force (N) and pressure (Pa), and its lowest height (m)."""
+    """Keeps the extremes of the plant's true force (N) and its lowest height (m)."""
 
     def __init__(self):
         self.world = None
-        self.least = self.most = self.least_pressure = 0.0
+        self.least = self.most = 0.0
         self.lowest = 1.0
 
     def frame(self, frame):
         state = self.world.plant.state
         self.least, self.most = min(self.least, state.force), max(self.most, state.force)
-        self.least_pressure = min(self.least_pressure, state.pressure)
         self.lowest = min(self.lowest, self.world.plant.axis.position)
 
 
@@ -139,3 +141,37 @@ def test_a_force_that_does_not_scatter_is_refused(request_for, truth, monkeypatc
     assert ending.exit_code == 4
     assert "step tare: the force does not scatter" in ending.reason
     assert truth.most < 0.01
+
+
+def test_a_chamber_smaller_than_said_is_not_pumped_far_beyond_its_pressure(request_for, truth, monkeypatch):
+    make = emulation.truth
+
+    def tenth(scene, seed):
+        world = make(scene, seed)
+        return dataclasses.replace(world, chamber=dataclasses.replace(world.chamber, volume=world.chamber.volume / 10))
+
+    monkeypatch.setattr(emulation, "truth", tenth)
+    request = request_for("sphere-60mm-low")  # -3.2 kPa; the preload has made +2.2 kPa
+    ending = run(request, truth)
+    assert ending.exit_code == 4
+    assert "chamber_volume_ml = 7.2" in ending.reason
+    assert load_recording(request.out).pressure.min() > -6.5e3
+    assert truth.least > -2.0
+
+
+def test_a_dead_load_cell_ends_the_approach_where_contact_should_have_been(request_for, truth):
+    dead = Faults([Fault("force", "over_range", value=0.0)])  # noise there is, force not
+    ending = run(request_for(faults=dead), truth)
+    assert ending.exit_code == 4
+    assert "no contact down to 18.500 mm" in ending.reason
+    assert "press the load cell by hand" in ending.reason
+    assert "minimum_mm" not in ending.reason
+    assert truth.lowest > 18.49e-3
+
+
+def test_an_approach_that_begins_too_low_ends_there(request_for, truth):
+    with pytest.raises(FileError, match="lowest_contact_mm = 23 must lie within"):
+        bench_with(("lowest_contact_mm = 18.5", "lowest_contact_mm = 23.0"))
+    ending = run(request_for(), truth, bench_with(("lowest_contact_mm = 18.5", "lowest_contact_mm = 21.5")))
+    assert "no contact down to 21.500 mm" in ending.reason
+    assert truth.lowest > 21.49e-3
