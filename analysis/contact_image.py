@@ -89,7 +89,7 @@ def measure_contact(
     Raises
     ------
     AnalysisError
-        Scale or image are no numbers, the image has no contrast, or no region stands out.
+        Scale or image are no numbers, the image has no contrast, no region stands out, or the contact is in pieces.
     """
     _check_scale(metres_per_pixel, scale_uncertainty, fiber_spacing)
     blur = max(1.5, fiber_spacing / metres_per_pixel / 2)
@@ -106,7 +106,13 @@ def measure_contact(
             remarks.append("no peel zone: no third grey level stands apart from contact and background")
         else:
             level = zone[0]
-    mask = _largest_region(grey < level)
+    dark = grey < level
+    mask = _largest_region(dark)
+    if mask.sum() < dark.sum() / 2:
+        raise AnalysisError(
+            f"the largest region holds {mask.sum() / dark.sum():.1%} of the contact's pixels: it is in pieces. Remedy: "
+            "--fiber-spacing where the image resolves fibres; else crop it to the contact"
+        )
     if mask[[0, -1]].any() or mask[:, [0, -1]].any():
         remarks.append("the contact touches the border of the image: the area is too small. Remedy: a wider image")
     area = _area(grey, level, pixel, scale_uncertainty, "largest region below the threshold")

@@ -147,6 +147,13 @@ def jkr_force_at(contact: Array, work_of_adhesion: float, radius: float, modulus
     return np.asarray(4 * modulus * (contact**3 / (3 * radius) - np.sqrt(pull * contact**3)), dtype=float)
 
 
+def jkr_contact_under(load: float, work_of_adhesion: float, radius: float, modulus: float) -> float:
+    """Return the JKR contact radius under a compressive load (N), m (Johnson, Kendall and Roberts 1971, Eq. 13)."""
+    pull = 3 * math.pi * work_of_adhesion * radius
+    cube = 3 * radius / (4 * _positive(modulus, "modulus")) * (load + pull + math.sqrt(2 * pull * load + pull**2))
+    return float(np.cbrt(cube))
+
+
 def dmt_curve(
     work_of_adhesion: float, radius: float, modulus: float, *, largest_contact: float, points: int = 200
 ) -> ContactCurve:

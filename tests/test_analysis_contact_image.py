@@ -39,6 +39,16 @@ def test_the_largest_region_counts_and_holes_are_filled() -> None:
     assert not found.mask[60, 60]
 
 
+def test_one_fibre_is_not_taken_for_the_contact() -> None:
+    y, x = np.mgrid[:400, :400]
+    fibres = np.hypot((x % 25) - 12, (y % 25) - 12) < 9
+    image = np.where(fibres & (np.hypot(x - 200, y - 200) < 125), 60.0, 200.0)
+    with pytest.raises(AnalysisError, match=r"in pieces.*--fiber-spacing"):
+        measure_contact(image, 4e-6)
+    joined = measure_contact(image, 4e-6, fiber_spacing=100e-6)
+    assert joined.area.value == pytest.approx(np.pi * 0.5e-3**2, rel=0.05)
+
+
 def test_colour_and_bright_contacts() -> None:
     grey = disk(0.4e-3)
     colour = np.repeat(grey[..., None], 3, axis=2)

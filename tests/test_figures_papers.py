@@ -100,6 +100,46 @@ def test_5f_shows_the_maxima_of_the_model(tmp_path: Path) -> None:
     assert best["diameter_m"] * 1e3 == pytest.approx(33, abs=2)
     drop = 1 - high["pull_off_distance_m"].iloc[-1] / best["pull_off_distance_m"]
     assert drop == pytest.approx(0.11, abs=0.02)
+    low = data[data["series"] == "-1.0 kPa"]
+    assert low.loc[low["pull_off_distance_m"].idxmax(), "diameter_m"] == pytest.approx(29.8e-3, abs=0.1e-3)
+    assert np.diff(low["diameter_m"]).max() <= 1.001e-3
+
+
+@pytest.mark.parametrize("number", ["5d", "5e", "6a", "6d", "6g", "6h"])
+def test_a_picture_of_a_model_names_it_and_what_it_assumes(number: str) -> None:
+    with canvas() as figure:
+        find(number).draw(figure, Material())
+        title = figure.axes[0].get_title(loc="left")
+    assert "model cone" in title
+    assert "$P_0$" in title
+    assert ("assumed" in title) == (number in ("6a", "6d", "6g"))
+    assert {"6a": "$d_b$ = 30 mm", "6d": "$d_b$ = 30 mm", "6g": "$d_b$ = 60 mm"}.get(number, "") in title
+
+
+def test_s8_shows_the_beginning_of_the_retraction(tmp_path: Path) -> None:
+    data = pd.read_csv(draw("S8", Material(), tmp_path / "figure.png"))
+    beginning = data[data["series"] == "beginning"]
+    assert len(beginning) > 50
+    assert beginning["retraction_m"].max() < 101e-6
+    assert np.all(np.diff(beginning["force_N"]) < 0)
+    assert np.diff(beginning["force_N"]).min() > -1e-3
+    assert "7.9999 mm" in set(data["series"])
+
+
+def test_s9_without_recordings_begins_at_the_preload(tmp_path: Path) -> None:
+    data = pd.read_csv(draw("S9", Material(), tmp_path / "figure.png"))
+    assert data.groupby("series")["force_N"].max().to_list() == pytest.approx([0.1, 0.1])
+
+
+def test_3e_takes_the_membrane_nearest_to_no_pressure_and_names_it() -> None:
+    flats = group(analysed(None, pressure) for pressure in (1000.0, 0.0, -1000.0))
+    with canvas() as figure:
+        find("3e").draw(figure, Material(flats))
+        legend = figure.axes[0].get_legend()
+        assert legend is not None
+        words = [text.get_text() for text in legend.get_texts()]
+        assert "75 µm" in figure.axes[0].get_title(loc="left")
+    assert words[0].startswith("FAM, $P_0$ = +0.0 kPa")
 
 
 @pytest.mark.parametrize(("number", "distance"), [("6h", 1.59e-3), ("6i", 1.26e-3)])

@@ -10,6 +10,7 @@ import numpy as np
 from analysis.errors import AnalysisError
 from analysis.figures.parts import (
     BAND,
+    PAPER_MEMBRANE,
     Series,
     draw_band,
     draw_model,
@@ -94,7 +95,7 @@ def figure_2a(figure: Figure, material: Material) -> pd.DataFrame:
     axes.set_xlabel("Time since the start of the retraction at 10 µm/s [s]")
     force_axis(axes)
     pressure_axis(axes).plot(time, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
-    axes.set_title(f"Model: {EXAMPLE}", loc="left")
+    axes.set_title(f"model {material.model}: {EXAMPLE}", loc="left", fontsize=9)
     series.add(
         EXAMPLE_NAME,
         f"model {prediction.model}",
@@ -128,7 +129,7 @@ def figure_2b(figure: Figure, material: Material) -> pd.DataFrame:
         draw_model(axes, prediction, BLUE, EXAMPLE_NAME, series)
         stable = prediction.stable
         twin.plot(prediction.retraction[stable] * 1e3, prediction.pressure[stable] * 1e-3, "--", color=ORANGE)
-        axes.set_title(f"Model: {EXAMPLE}", loc="left", fontsize=9)
+        axes.set_title(f"model {material.model}: {EXAMPLE}", loc="left", fontsize=9)
         return series.frame()
     mean = draw_band(axes, example, BLUE, str(example.condition), series)
     if mean is not None and mean.pressure is not None and mean.pressure_deviation is not None:
@@ -156,7 +157,8 @@ def _by_pressure(figure: Figure, material: Material, diameter: float) -> pd.Data
         scenes = _published_scenes(diameter)
         for (pressure, parameters), color in zip(scenes, shades(len(scenes)), strict=True):
             draw_model(axes, material.predict(parameters), color, kilopascal(pressure), series)
-        axes.set_title(f"$d_b$ = {diameter * 1e3:g} mm, model (no recordings)", loc="left")
+        words = f"$d_b$ = {diameter * 1e3:g} mm, model {material.model} (no recordings)"
+        axes.set_title(words, loc="left", fontsize=9)
     profile_axes(axes)
     frame_profile(axes)
     axes.legend(title="$P_0$")
@@ -209,9 +211,9 @@ def _spheres(figure: Figure, material: Material, *, highest: bool, with_model: b
     frame_profile(axes)
     axes.legend(title="$d_b$, $P_0$")
     if not material.pull_offs():
-        axes.set_title("model (no recordings)", loc="left")
+        axes.set_title(f"model {material.model} (no recordings)", loc="left", fontsize=9)
     elif with_model:
-        axes.set_title(f"solid: experiment, dashed: model\n{BAND}", loc="left", fontsize=9)
+        axes.set_title(f"solid: experiment, dashed: model {material.model}\n{BAND}", loc="left", fontsize=9)
     return series.frame()
 
 
@@ -225,20 +227,26 @@ def figure_3d(figure: Figure, material: Material) -> pd.DataFrame:
 def figure_3e(figure: Figure, material: Material) -> pd.DataFrame:
     """Draw F_r against z_r of the membrane (FAM) and of the fibres on a rigid punch (FARP), and the energy of each.
 
-    The papers hold no model of the punch: without a recording of it only the membrane is drawn.
+    Of several pressures of the membrane the one nearest to zero is drawn. The papers hold no model of the punch:
+    without a recording of it only the membrane is drawn.
     """
     axes, series = figure.subplots(), Series()
     punches = material.pull_offs("punch")
     punches += [m for m in material.groups if m.condition.protocol == "punch"]
     flats = _of_substrate(material, None)
     if flats:
-        draw_band(axes, flats[0], BLUE, "FAM" + _energy(flats[0]), series)
+        unloaded = min(flats, key=lambda members: abs(members.condition.pressure or 0.0))
+        membrane, pressure = _parameters(unloaded).membrane, unloaded.condition.pressure
+        gas = "vented" if pressure is None else f"$P_0$ = {kilopascal(pressure)}"
+        draw_band(axes, unloaded, BLUE, f"FAM, {gas}" + _energy(unloaded), series)
     else:
-        draw_model(axes, material.predict(scene(None, 0.0)), BLUE, "FAM, model", series)
+        membrane = PAPER_MEMBRANE
+        draw_model(axes, material.predict(scene(None, 0.0)), BLUE, f"FAM, $P_0$ = 0, model {material.model}", series)
     if punches:
         draw_band(axes, punches[0], ORANGE, "FARP" + _energy(punches[0]), series)
-    else:
-        axes.set_title("FARP: no recording, and no model in the papers", loc="left")
+    here = f"FAM of {membrane.thickness * 1e6:g} µm, {membrane.youngs_modulus * 1e-6:g} MPa; EML: 75 µm, polyurethane"
+    lacking = "" if punches else "\nFARP: no recording, and no model in the papers"
+    axes.set_title(here + lacking, loc="left", fontsize=9)
     profile_axes(axes)
     frame_profile(axes)
     axes.legend()
@@ -282,8 +290,7 @@ def figure_5c(figure: Figure, material: Material) -> pd.DataFrame:
             forces = np.array([prediction.pull_off_force for prediction in predictions])
             axes.plot(pressures * 1e-3, forces, "--", color=color, label=None if groups else label)
             series.add(label, f"model {material.model}", initial_pressure_Pa=pressures, pull_off_force_N=forces)
-    axes.plot([], [], "o", color=BLACK, markerfacecolor="none", label="published, Table S1")
-    axes.plot([], [], "--", color=BLACK, label=f"model ({material.model})")
+    axes.set_title(f"open: published, Table S1; dashed: model {material.model}", loc="left", fontsize=9)
     axes.set_xlabel("Initial pressure $P_0$ [kPa]")
     axes.set_ylabel("Pull-off force $F_p$ [N]")
     axes.set_ylim(bottom=0)
@@ -335,8 +342,8 @@ def _measured_points(
 JKR_RADIUS = 4e-3
 JKR_MODULUS = 1.9e6
 """Contact modulus of the fibrillar layer that gives the papers' contact of 0.5 mm radius at 78 mN, Pa."""
-JKR_CONTACT = 0.92e-3
-"""Contact radius under the preload of about 100 mN, m."""
+JKR_PRELOAD = 0.1
+"""N."""
 
 
 @paper_figure("S9", "SI S9: JKR test of the membrane, rigid and soft system", (8.6, 3.8))
@@ -353,7 +360,8 @@ def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
             _draw_indentations(axes, [members.kept[0] for members in found], series)
             axes.set_title(f"{letter}  {gripper} system", loc="left")
         else:
-            curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=JKR_CONTACT)
+            contact = jkr.jkr_contact_under(JKR_PRELOAD, work, JKR_RADIUS, JKR_MODULUS)
+            curve = jkr.jkr_curve(work, JKR_RADIUS, JKR_MODULUS, largest_contact=contact)
             last = curve.indentation[-1] * 1e3
             axes.plot(np.append(curve.indentation * 1e3, last), np.append(curve.force * 1e3, 0), "--", color=BLUE)
             axes.set_title(f"{letter}  {gripper} system: JKR, $\\omega$ = {work} J/m² (no recordings)", loc="left")
