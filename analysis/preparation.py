@@ -133,6 +133,9 @@ def tare(work: Extraction) -> Details:
 def _without_creep(work: Extraction, level: float, margin: int) -> Array:
     """Return the force with what the load train's creep has taken from it; the recorded one where none is known."""
     run, sensors = work.run, work.run.sensors
+    if run.protocol in WITHOUT_CONTACT:
+        work.missing["creep_fraction"] = "nothing is pressed"
+        return run.force
     after = _after_detachment(work, margin)
     if sensors.creep_time > 0:
         calibrated = (sensors.creep, sensors.creep_uncertainty, sensors.creep_time)
@@ -144,7 +147,8 @@ def _without_creep(work: Extraction, level: float, margin: int) -> Array:
         work.missing["creep_fraction"] = "the force does not creep back after detachment"
         return run.force
     work.set(creep_fraction=creep.share)
-    work.stated["creep_fraction"] = creep.uncertainty
+    if sensors.creep_time == 0:
+        work.stated["creep_fraction"] = creep.uncertainty  # else the budget's creep is this very number
     return run.force + creep.share * creep.response
 
 

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 OUTLIER_RULE = (
-    "Grubbs' test at 1 % on F_p and on D_p of the repeats of one condition, at least four repeats, one outlier at a "
-    "time; a value within three standard uncertainties of the mean is never one. Outliers are left out of means and "
-    "bands, and listed."
+    "Grubbs' test at 5 % on F_p and on D_p of the repeats of one condition, at least four repeats, one outlier at a "
+    "time: how far a value is from the mean of the others, over their standard deviation and its own standard "
+    "uncertainty. Outliers are left out of means and bands, and listed."
 )
 
 RANDOM_SOURCES = frozenset({"noise", "sampling", "drift", "contact point"})
@@ -250,24 +250,27 @@ def _outliers(members: Sequence[Analysis]) -> dict[str, str]:
 
 
 def _grubbs(named: Sequence[tuple[str, Quantity]]) -> dict[str, str]:
-    """Return the outliers of one quantity, by name, with what gave them away."""
+    """Return the outliers of one quantity, by name, with what gave them away.
+
+    Grubbs (Technometrics 11, 1, 1969) in its equal form with the mean and deviation of the others. At 5 %, the level of
+    ISO 5725-2 for stragglers: at 1 % one of five has to be 11 of their deviations away, at 5 % it is 6.5.
+    """
     from scipy.stats import t
 
     left = list(named)
     found: dict[str, str] = {}
     while len(left) >= 4:
         values = np.array([quantity.value for _, quantity in left])
-        deviation, n = float(values.std(ddof=1)), len(left)
+        n = len(left)
         far = int(np.argmax(np.abs(values - values.mean())))
-        distance = abs(float(values[far] - values.mean()))
-        quantile = float(t.ppf(1 - 0.01 / (2 * n), n - 2))
-        critical = (n - 1) / np.sqrt(n) * np.sqrt(quantile**2 / (n - 2 + quantile**2))
-        if distance <= critical * deviation or distance <= 3 * left[far][1].uncertainty:
+        others = np.delete(values, far)
+        deviation = np.hypot(others.std(ddof=1), np.nan_to_num(left[far][1].uncertainty)) * np.sqrt(n / (n - 1))
+        distance = abs(float(values[far] - others.mean()))
+        limit = float(t.ppf(1 - 0.05 / (2 * n), n - 2))
+        if distance <= limit * deviation:
             break
         name, quantity = left.pop(far)
-        found[name] = (
-            f"= {quantity}, {distance / deviation:.2f} standard deviations from the mean (limit {critical:.2f})"
-        )
+        found[name] = f"= {quantity}, {distance / deviation:.1f} deviations from the others (limit {limit:.1f})"
     return found
 
 

@@ -15,7 +15,7 @@ from analysis.extraction import markdown, ordered
 from analysis.loading import CONTACT_METHODS
 from analysis.numerics import Noise, find_jumps, fit_around, on_grid
 from analysis.pipeline import lighten
-from analysis.synthetic import Experiment, Imperfections, Profile, pull_off_run
+from analysis.synthetic import Experiment, Imperfections, Profile, pull_off_run, volume_run
 from model import Gas, Parameters, Substrate, predict
 
 FAST = Experiment(rate=500.0, retract_speed=50e-6, dwell=3.0, settle=2.0, tail=4.0)
@@ -295,6 +295,14 @@ def test_light_copies_keep_features_and_curve() -> None:
     whole = on_grid(analysis.curve.retraction, analysis.curve.force, grid)
     assert on_grid(light.curve.retraction, light.curve.force, grid) == pytest.approx(whole, abs=3e-3)
     assert light.features.value("pull_off_force_N") == analysis.features.value("pull_off_force_N")
+
+
+def test_calibrated_creep_is_no_measurement_and_counts_once() -> None:
+    known = Sensors(creep=0.06, creep_uncertainty=0.003, creep_time=9.0)
+    run, _ = quiet_run(flaws={"creep": 0.06}, sensors=known)
+    assert analyze(run).features["creep_fraction"].budget == {"creep": pytest.approx(0.003)}
+    closed = volume_run(7e-6, sensors=known)
+    assert "creep_fraction" not in analyze(closed).features
 
 
 def test_a_kink_narrows_the_window_of_a_fit() -> None:

@@ -80,6 +80,16 @@ def test_an_outlier_is_left_out_and_named_with_its_rule() -> None:
     assert pooled.mean == pytest.approx(0.5, abs=0.002)
 
 
+def test_one_gross_outlier_of_five_does_not_hide_behind_its_own_deviation() -> None:
+    from analysis.repeats import _grubbs
+
+    forces = [0.516, 0.524, 0.537, 0.547, 0.689]
+    named = [(str(i), Quantity(force, 0.003, "N")) for i, force in enumerate(forces)]
+    assert list(_grubbs(named)) == ["4"]
+    unsure = [(name, Quantity(force.value, 0.03, "N")) for name, force in named]
+    assert _grubbs(unsure) == {}
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_normal_repeats_are_rarely_outliers(seed: int) -> None:
     generator = np.random.default_rng(seed)
