@@ -253,6 +253,14 @@ class Bench(Section):
         return self
 
     @rule
+    def _has_a_port_each(self) -> Bench:
+        if self.pump is not None and self.stage.connection == self.pump.connection != EMULATED:
+            raise ValueError(
+                f"stage.connection and pump.connection are both {self.stage.connection!r}; each has a port of its own"
+            )
+        return self
+
+    @rule
     def _is_filled_in(self) -> Bench:
         texts = {
             "stage.connection": self.stage.connection,

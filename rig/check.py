@@ -322,6 +322,12 @@ def room_um(bench: Bench, force: float) -> float:
     return (OVERLOAD * bench.force.capacity_N - force) * compliance
 
 
+def return_speed(bench: Bench) -> float:
+    """Return the fastest speed (m/s) at which both force limits stop the stage in time, whatever it meets."""
+    worst = max(bench.limits.compression_N, bench.limits.tension_N)
+    return room_um(bench, worst) * 1e-6 / reaction_s(bench)
+
+
 def parking(bench: Bench) -> Parking:
     """Return how the stage is brought to its starting height, so that it harms nothing that is in its way."""
     touch = TOUCH * bench.force.capacity_N

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drivers.interfaces import Pump, Stage
 from rig.bench import Bench
-from rig.check import AT_REST, room_um
+from rig.check import AT_REST, return_speed, room_um
 from rig.scene import (
     ComplianceSection,
     ContactSection,
@@ -33,6 +33,7 @@ def apparatus_of(bench: Bench, stage: Stage, pump: Pump | None, tell: Teller) ->
         lowest_contact=bench.stage.lowest_m,
         at_rest=bench.force.at_rest_N,
         at_rest_within=AT_REST * bench.force.capacity_N,
+        return_speed=return_speed(bench),
     )
 
 

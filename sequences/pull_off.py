@@ -250,4 +250,5 @@ class PullOff:
     def _return(self, frame: Frame) -> Steps:
         """Go up to the starting height."""
         target = max(self._start_height, frame.stage.position)
-        return travel(self._apparatus, target, self._settings.return_speed, "return", frame)
+        speed = min(self._settings.return_speed, self._apparatus.return_speed)
+        return travel(self._apparatus, target, speed, "return", frame)

@@ -62,6 +62,8 @@ class Apparatus:
         Where the approach ends without contact, m.
     at_rest, at_rest_within
         What the load cell reads with the gripper free, and how far from it a tare may lie, N.
+    return_speed
+        The fastest at which a force limit stops the stage in time, whatever it meets, m/s.
     """
 
     stage: Stage
@@ -73,6 +75,7 @@ class Apparatus:
     lowest_contact: float = -math.inf
     at_rest: float = 0.0
     at_rest_within: float = math.inf
+    return_speed: float = math.inf
 
     def ahead(self, frame: Frame) -> float:
         """Return how far ahead of its position the stage may be commanded, m: the cell outlives this program."""

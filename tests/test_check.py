@@ -329,3 +329,14 @@ def test_the_shipped_paper_rig_measures_its_compliance_as_it_is():
     bench = parse_bench(text.replace("FILL-IN", "a").replace("FILL IN", "a"), "paper-rig")
     assert bench.force.compliance_um_per_N == 0.0
     assert not said(bench, "compliance")
+
+
+def test_the_return_is_no_faster_than_the_force_limits_can_stop(request_for):
+    """(overload - larger limit) c / (t_f + t_r): (5.884 - 4.4) N * 12 um/N / 70 ms."""
+    request = request_for()
+    assert run_scene(request).exit_code == 0
+    events = load_recording(request.out).events
+    begun = next(row["sample"] for row in load_recording(request.out).steps if row["name"] == b"return")
+    speeds = [row["text"].decode() for row in events if row["sample"] >= begun and b"speed" in row["text"]]
+    assert len(speeds) == 1
+    assert float(speeds[0].split()[2]) == pytest.approx(254.4, abs=0.1)

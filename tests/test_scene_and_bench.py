@@ -94,6 +94,14 @@ def test_what_is_no_ordinary_file_is_refused_without_waiting_for_its_end(tmp_pat
         load_scene(long)
 
 
+def test_stage_and_pump_at_one_port_are_refused():
+    text, _ = find("bench", "emulated")
+    for name, connection in {"stage": "COM1", "pump": "COM1", "daq": "local"}.items():
+        text = text.replace(f'[{name}]\nconnection = "emulated"', f'[{name}]\nconnection = "{connection}"')
+    with pytest.raises(FileError, match=r"stage\.connection and pump\.connection are both 'COM1'"):
+        parse_bench(text, "b.toml")
+
+
 @pytest.mark.parametrize(
     "address", ["socket://127.0.0.1:99999", "socket://[::1", f"socket://{'a' * 80}.de:1", "grpc://127.0.0.1:99999"]
 )
