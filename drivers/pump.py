@@ -199,6 +199,7 @@ class LegatoPump:
         self._version = ""
         self._finished = 0.0
         self._run: tuple[float, float] | None = None
+        self._furthest = 0.0
         self._port = self._open(baud)
         try:
             self._identity = self._identify(expected_model)
@@ -228,9 +229,8 @@ class LegatoPump:
         """
         with self._lock:
             sent = self._clock()
-            reply = self._ask("@status")
+            reply, rate, volume = self._poll("@status")
             received = self._clock()
-            rate, volume = self._progress(reply)
             self._check_target(reply.state, volume)
         return PumpStatus(sent, received, reply.state, rate, self._finished + volume)
 
@@ -253,8 +253,12 @@ class LegatoPump:
             self._check_setting(f"{letter}rate", rate)
             self._check_setting("tvolume", abs(volume))
             self._run = (math.copysign(parse_quantity(target), volume), rate)
+            self._furthest = 0.0
             state = self._exchange(f"{letter}run").state
-        if state not in (*RUNNING, PumpState.TARGET_REACHED):
+        wanted = PumpState.INFUSING if volume > 0 else PumpState.WITHDRAWING
+        if state in RUNNING and state is not wanted:  # "irun" or "wrun" without its first letter runs either way
+            self.stop()
+        if state not in (wanted, PumpState.TARGET_REACHED):
             raise MotionFault(DEVICE, f"does not start: it is {state}", "look at the pump's screen and at the syringe")
 
     def stop(self) -> None:
@@ -337,6 +341,16 @@ class LegatoPump:
 
     # ------------------------------------------------------------------ state
 
+    def _poll(self, command: str) -> tuple[Reply, float, float]:
+        """Ask for the status, and again if the run's volume has shrunk: a number that has lost a digit is one still."""
+        for _ in range(2):
+            reply = self._ask(command)
+            rate, volume = self._progress(reply)
+            if abs(volume) >= self._furthest:
+                break
+        self._furthest = abs(volume)
+        return reply, rate, volume
+
     def _progress(self, reply: Reply) -> tuple[float, float]:
         """Return signed rate (m^3/s) and signed volume of the present or last run (m^3)."""
         with self._understanding("status"):
@@ -364,7 +378,7 @@ class LegatoPump:
         """Stop and add what the run has delivered to what earlier ones have."""
         self._ask("stp")
         if self._run is not None:
-            self._finished += self._progress(self._ask("status"))[1]
+            self._finished += self._poll("status")[2]
             self._run = None
 
     def _check_diameter(self) -> None:

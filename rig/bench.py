@@ -253,14 +253,6 @@ class Bench(Section):
         return self
 
     @rule
-    def _has_a_port_each(self) -> Bench:
-        if self.pump is not None and self.stage.connection == self.pump.connection != EMULATED:
-            raise ValueError(
-                f"stage.connection and pump.connection are both {self.stage.connection!r}; each has a port of its own"
-            )
-        return self
-
-    @rule
     def _is_filled_in(self) -> Bench:
         texts = {
             "stage.connection": self.stage.connection,
@@ -270,6 +262,14 @@ class Bench(Section):
         empty = [key for key, text in texts.items() if "FILL" in text]
         if empty:
             raise ValueError(f"still to be filled in: {', '.join(empty)}")
+        return self
+
+    @rule
+    def _has_a_port_each(self) -> Bench:
+        if self.pump is not None and self.stage.connection == self.pump.connection != EMULATED:
+            raise ValueError(
+                f"stage.connection and pump.connection are both {self.stage.connection!r}; each has a port of its own"
+            )
         return self
 
     @property

@@ -326,7 +326,7 @@ def test_the_pump_is_stopped_before_anybody_waits_for_a_silent_stage(request_for
 def test_the_shipped_paper_rig_measures_its_compliance_as_it_is():
     text = (Path(__file__).parents[1] / "benches" / "paper-rig.toml").read_text("utf-8")
     text = re.sub(r"^(slope|relative_uncertainty|residual) = 0\.0", r"\1 = 0.01", text, flags=re.MULTILINE)
-    bench = parse_bench(text.replace("FILL-IN", "a").replace("FILL IN", "a"), "paper-rig")
+    bench = parse_bench(text.replace("FILL-IN", "a", 1).replace("FILL-IN", "b").replace("FILL IN", "a"), "paper-rig")
     assert bench.force.compliance_um_per_N == 0.0
     assert not said(bench, "compliance")
 

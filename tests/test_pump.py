@@ -430,3 +430,52 @@ def test_nonsense_in_operation_is_a_device_error_or_a_finite_volume(replies, cal
     for call, result in outcomes(pump, "pump", calls):
         if call is LegatoPump.status:
             assert abs(result.volume) < float("inf")
+
+
+# ---------------------------------------------------------------- a lost character
+
+
+@pytest.mark.parametrize("digit", range(9))
+def test_a_volume_that_has_lost_a_digit_is_asked_again(virtual, world, monkeypatch, digit):
+    """Whichever digit it is, the number is ten times smaller: a stroke taken up again would go that much too far."""
+    pump = virtual
+    pump.dispense(0.5e-6, 0.1e-6)
+    for _ in range(3):
+        world.pass_time(1.0)
+        before = pump.status().volume
+    hurt, read = [], pump._port.read_until
+
+    def garbled(expected, size):
+        data = read(expected, size)
+        words = data.split(b" ")
+        if len(words) == 4 and not hurt:
+            hurt.append(data)
+            words[2] = words[2][:digit] + words[2][digit + 1 :]
+        return b" ".join(words)
+
+    monkeypatch.setattr(pump._port, "read_until", garbled)
+    world.pass_time(0.1)
+    assert pump.status().volume > before
+    assert hurt
+    pump.stop()
+    hurt.clear()
+    pump.dispense(-0.1e-6, 0.1e-6)
+    assert hurt
+    world.pass_time(2.0)
+    assert pump.status().volume == pytest.approx(0.31e-6 - 0.1e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize("volume", [0.1e-6, -0.1e-6])
+def test_a_pump_that_runs_the_wrong_way_is_stopped(virtual, world, monkeypatch, volume):
+    pump = virtual
+    pump.dispense(-volume / 10, 0.1e-6)
+    world.pass_time(1.0)
+    write = pump._port.write
+    monkeypatch.setattr(pump._port, "write", lambda data: write(data.replace(b"irun", b"run").replace(b"wrun", b"run")))
+    try:
+        pump.dispense(volume, 0.1e-6)
+    except MotionFault as error:
+        assert "does not start: it is" in str(error)
+        assert world.syringe.rate == 0
+    else:
+        assert world.syringe.rate * volume > 0

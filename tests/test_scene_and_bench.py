@@ -156,7 +156,10 @@ def test_the_paper_rig_must_be_filled_in():
         text = text.replace(f"{key} = 0.0", f"{key} = 0.01")
     with pytest.raises(FileError, match=r"still to be filled in: stage.connection, pump.connection"):
         parse_bench(text, "paper-rig.toml")
-    assert parse_bench(text.replace("FILL-IN", "a").replace("FILL IN", "a"), "x").force.cell == "GSO-500"
+    assert (
+        parse_bench(text.replace("FILL-IN", "a", 1).replace("FILL-IN", "b").replace("FILL IN", "a"), "x").force.cell
+        == "GSO-500"
+    )
 
 
 def test_a_frame_holds_a_whole_number_of_samples_and_at_least_one():
