@@ -20,6 +20,10 @@ OVERLOAD = 1.2
 """What a load cell survives, in capacities."""
 
 
+GIVES_MM = 1.0
+"""What a load cell with its frame may give at its capacity, mm; the emulated ones give 0.06 and 0.2."""
+
+
 class StageSection(Section):
     """``[stage]``: PI controller with a linear stage.
 
@@ -146,6 +150,16 @@ class ForceSection(Section):
     creep_uncertainty_percent: Annotated[float, Field(ge=0, le=30)] = 0.0
     creep_time_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
     calibration: CalibrationSection
+
+    @rule
+    def _gives_like_a_cell(self) -> ForceSection:
+        most = self.compliance_um_per_N * self.capacity_N * 1e-3
+        if most > GIVES_MM:
+            raise ValueError(
+                f"compliance_um_per_N = {self.compliance_um_per_N:g}: the cell would give by {most:.3g} mm at its "
+                f"capacity (at most {GIVES_MM:g} mm); enter um per N"
+            )
+        return self
 
 
 class ZeroSection(Section):

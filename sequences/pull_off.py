@@ -123,7 +123,7 @@ class PullOff:
 
     def _approach(self, frame: Frame) -> Steps:
         lowest = max(self._apparatus.stage.travel[0], self._apparatus.lowest_contact)
-        motion = Motion(self._apparatus, lowest, self._settings.approach_speed)
+        motion = Motion(self._apparatus, lowest, self._settings.approach_speed, "approach")
         with stopping_on_failure(self._apparatus.stage):
             while abs(self._force(frame)) < self._settings.contact_force:
                 if frame.stage.position < lowest or motion.arrived(frame):
@@ -142,7 +142,7 @@ class PullOff:
 
     def _preload(self, frame: Frame) -> Steps:
         goal = self._settings.preload
-        motion = Motion(self._apparatus, self._apparatus.stage.travel[0], self._settings.approach_speed)
+        motion = Motion(self._apparatus, self._apparatus.stage.travel[0], self._settings.approach_speed, "preload")
         last = frame
         try:
             while self._force(frame) < goal:
@@ -189,7 +189,7 @@ class PullOff:
         return (yield from gas.bring_to(goal, frame))
 
     def _retract(self, frame: Frame) -> Steps:
-        motion = self._retraction(frame)
+        motion = self._retraction("retract")
         least = self._force(frame)
         with stopping_on_failure(self._apparatus.stage):
             while not self._peak_passed(self._force(frame), least):
@@ -203,7 +203,7 @@ class PullOff:
         return frame
 
     def _pull_off(self, frame: Frame) -> Steps:
-        motion = self._retraction(frame)
+        motion = self._retraction("pull-off")
         band = max(self._settings.contact_force / 2, 6 * self._noise, 0.04 * -self._least_force)
         quiet = 0
         recent: deque[float] = deque(maxlen=max(2, round(0.5 * frame.rate / frame.force.size)))
@@ -219,10 +219,10 @@ class PullOff:
         self._apparatus.tell.note(f"detached below {frame.stage.position * 1e3:.4f} mm")
         return frame
 
-    def _retraction(self, frame: Frame) -> Motion:
+    def _retraction(self, step: str) -> Motion:
         highest = self._apparatus.stage.travel[1]
         target = min(self._contact_height + self._settings.longest_retraction, highest)
-        return Motion(self._apparatus, target, self._settings.retract_speed)
+        return Motion(self._apparatus, target, self._settings.retract_speed, step)
 
     def _on(self, motion: Motion, frame: Frame, step: str) -> Steps:
         """Go on retracting by one frame."""

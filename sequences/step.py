@@ -157,12 +157,20 @@ class Motion:
     """A move commanded a short stretch at a time, so that the stage stops by itself if the program dies.
 
     Call ``extend`` with every frame. After a hold the move is taken up again.
+
+    Raises
+    ------
+    StepFailed
+        Named by ``step``: it takes much longer than it should.
     """
 
     _RESOLUTION = 1e-6
+    _DELAY = 30.0
 
-    def __init__(self, apparatus: Apparatus, target: float, speed: float) -> None:
+    def __init__(self, apparatus: Apparatus, target: float, speed: float, step: str) -> None:
         self._apparatus = apparatus
+        self._step = step
+        self._left: float | None = None
         self._target = target
         self._commanded: float | None = None
         self._speed = speed
@@ -183,11 +191,19 @@ class Motion:
     def extend(self, frame: Frame) -> None:
         """Command the next stretch when half of the last one has been travelled."""
         position, ahead = frame.stage.position, self._apparatus.ahead(frame)
+        self._insist_on_progress(frame)
         if self._is_due(frame, position, ahead):
             low, high = self._apparatus.stage.travel
             way = min(max(self._target, low), high) - position
             self._commanded = position + max(min(way, ahead), -ahead)
             self._apparatus.stage.move_to(self._commanded)
+
+    def _insist_on_progress(self, frame: Frame) -> None:
+        if self._left is None:
+            self._left = (3 * abs(self._target - frame.stage.position) / self._speed + self._DELAY) * frame.rate
+        self._left -= frame.force.size
+        if self._left < 0:
+            raise StepFailed(self._step, "the stage does not arrive", "check the path and the stage's servo")
 
     def arrived(self, frame: Frame) -> bool:
         """Whether the stage stands at the target."""
@@ -224,17 +240,13 @@ def travel(
     StepFailed
         It takes much longer than it should.
     """
-    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.ahead(frame), apparatus.frame)))
-    left = (3 * abs(target - frame.stage.position) / motion.speed + 5) * frame.rate
+    motion = Motion(apparatus, target, min(speed, steady_speed(apparatus.ahead(frame), apparatus.frame)), name)
     try:
         while not motion.arrived(frame):
             motion.extend(frame)
             frame = yield
             watch(frame)
             apparatus.tell.progress(frame.stage.position, target, "m")
-            left -= frame.force.size
-            if left < 0:
-                raise StepFailed(name, "the stage does not arrive", "check the path and the stage's servo")
     finally:
         apparatus.stage.stop()
     return frame

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from test_check import bench_with, said
+from test_check import bench_with, refused_bench, said
 
 from drivers.emulated.direct import DirectDaq, DirectStage
 from drivers.emulated.faults import Fault, Faults
 from rig import emulation
 from rig.errors import FileError
-from rig.observe import Observer
+from rig.observe import Observer, StepPhase
 from rig.recording import load_recording
 from rig.session import run_scene
 
@@ -175,3 +175,23 @@ def test_an_approach_that_begins_too_low_ends_there(request_for, truth):
     ending = run(request_for(), truth, bench_with(("lowest_contact_mm = 18.5", "lowest_contact_mm = 21.5")))
     assert "no contact down to 21.500 mm" in ending.reason
     assert truth.lowest > 21.49e-3
+
+
+@pytest.mark.parametrize("step", ["approach", "preload", "retract", "pull-off"])
+def test_no_step_waits_for_ever_for_a_stage_that_does_not_go(request_for, truth, monkeypatch, step):
+    class Stubborn(Observer):
+        def step(self, event):
+            if event.name == step and event.phase is StepPhase.STARTED:
+                truth.world.plant.axis.halt(float("inf"))
+                monkeypatch.setattr(DirectStage, "move_to", lambda stage, height: None)
+
+    request = request_for(protocol={"retract_speed_um_s": 200.0, "approach_speed_um_s": 100.0})
+    request = dataclasses.replace(request, observers=[truth, Stubborn()])
+    ending = run_scene(dataclasses.replace(request, bench=bench_with(("minimum_mm = 1.0", "minimum_mm = 18.0"))))
+    assert ending.exit_code == 4
+    assert f"step {step}: the stage does not arrive" in ending.reason
+
+
+def test_a_compliance_in_the_wrong_unit_is_refused():
+    told = refused_bench(("compliance_um_per_N = 12.0", "compliance_um_per_N = 12000.0"))
+    assert "compliance_um_per_N = 12000: the cell would give by 58.8 mm" in told
