@@ -123,7 +123,7 @@ class Recorder:
     channels, units
         Names and units of the raw channels, in order.
     metadata
-        Texts kept whole beside the data: scene, bench, versions, seed, place, start of the process.
+        Texts kept whole beside the data: scene, bench, versions, seed, place, writer.
     journalled
         Whether what is acknowledged survives a power cut too, by a journal beside the recording (``rig.journal``).
 

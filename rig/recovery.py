@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
 
 import h5py
 import numpy as np
@@ -18,6 +17,10 @@ from rig.journal import journal_of, read_journal, sync, sync_folder
 from rig.layout import ENDING, PER_FRAME, PER_SAMPLE, complete, extend, filled, lay_out
 from rig.recording_file import entry_of, insist, opened, reading
 from rig.seal import is_sealed, probe, seal
+from rig.writer import lives
+
+QUIET_S = 60.0
+"""A recording that has not changed for so long is not being written: frames come all the time, in a hold too."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +45,28 @@ def recover(path: Path, *, force: bool = False) -> Recovery:
     FileError
         The file cannot be read at all.
     BeingWritten
-        The program that writes it is still running (``force`` overrides).
+        The program that writes it is still running, or may be (``force`` overrides).
     """
     insist(path)
     if not is_sealed(path):
         rewritten = _rewritten(path, force=force)
         if rewritten is not None:
             return rewritten
-        probe(path)
+        try:
+            probe(path)
+        except FileError as error:
+            if not journal_of(path).exists():
+                raise
+            raise FileError(
+                f"{error} Its journal, {journal_of(path)}, lies beside it: if the program that wrote it is dead, "
+                "`rig recover --force` writes the recording anew from that, or try again in a minute."
+            ) from error
     with opened(path) as file:
-        if file.swmr_mode and not force and _writer_lives(file):
-            raise BeingWritten(f"recording {path}: is still being written. Remedy: wait for the run to end.")
+        if file.swmr_mode and not force and _may_be_written(path, _writer_of(file)):
+            raise BeingWritten(
+                f"recording {path}: is still being written. Remedy: wait for the run to end; where its program has "
+                "died on another computer or in a container, wait a minute."
+            )
         if not file.swmr_mode:
             with reading(path):
                 return Recovery(path, *complete(entry_of(file, path)), repaired=False)
@@ -74,7 +88,8 @@ def _rewritten(path: Path, *, force: bool) -> Recovery | None:
         header, records = read_journal(journal)
     except FileError:
         return None
-    if not force and _author_lives(header["info"], header["metadata"]):
+    told = header["metadata"]
+    if not force and _may_be_written(path, told.get("writer") if isinstance(told, dict) else None):
         return None
     with _replacing(path) as fresh, h5py.File(fresh, "w", libver="latest") as file:
         sets = lay_out(file, **header)
@@ -109,24 +124,27 @@ def _replacing(path: Path) -> Iterator[Path]:
         ) from error
 
 
-def _writer_lives(file: h5py.File) -> bool:
-    """Whether the process that began the recording is still there."""
-    try:
-        info = json.loads(file["entry/configuration/run"].asstr()[()])
-        started = file["entry/configuration/process_started"].asstr()[()]
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeDecodeError):
-        return False
-    return _author_lives(info, {"process_started": started})
+def _may_be_written(path: Path, writer: object) -> bool:
+    """Whether the writer lives or, where nobody here can know, files of the recording have changed of late.
+
+    A recording may be looked at from another computer or container, or have been copied from there.
+    """
+    alive = lives(writer)
+    return _changed_lately(path) if alive is None else alive
 
 
-def _author_lives(info: Any, metadata: Any) -> bool:
-    """Whether the process that began a recording is still there, and no other one has its number."""
-    import psutil
+def _changed_lately(path: Path) -> bool:
+    """Whether it is a minute yet, by the clock of the disk: a server's may differ from ours."""
+    with suppress(OSError), TemporaryFile(dir=path.parent) as fresh:
+        now = os.fstat(fresh.fileno()).st_mtime
+        return any(abs(now - file.stat().st_mtime) < QUIET_S for file in (path, journal_of(path)) if file.exists())
+    return False  # nothing can be written there, and so nothing replaced
 
-    try:
-        return abs(psutil.Process(int(info["pid"])).create_time() - float(metadata["process_started"])) < 2.0
-    except (psutil.Error, LookupError, TypeError, ValueError, OverflowError):
-        return False
+
+def _writer_of(file: h5py.File) -> object:
+    with suppress(OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError):
+        return file["entry/configuration/writer"].asstr()[()]
+    return None
 
 
 def _copy(file: h5py.File, fresh: Path, samples: int, frames: int) -> None:

@@ -32,6 +32,7 @@ from rig.safe_state import make_safe, release
 from rig.scene import Scene
 from rig.undisturbed import undisturbed
 from rig.voice import say
+from rig.writer import this_process
 from sequences.errors import StepFailed
 from sequences.reference import reference
 from sequences.step import Step, play
@@ -319,8 +320,6 @@ def _info(request: Request, opened: Opened, steps: list[Step]) -> RunInfo:
 
 
 def _metadata(request: Request) -> dict[str, str]:
-    import psutil
-
     return {
         "scene": request.scene_text,
         "bench": request.bench_text,
@@ -330,7 +329,7 @@ def _metadata(request: Request) -> dict[str, str]:
         "versions": json.dumps(
             {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}, sort_keys=True
         ),
-        "process_started": repr(psutil.Process().create_time()),
+        "writer": this_process(),
     }
 
 

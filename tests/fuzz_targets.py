@@ -376,7 +376,7 @@ def journal(data: bytes) -> None:
     """A journal whose checksums are right and whose content is not."""
     choices = Choices(data)
     header = {"info": {"pid": -1, "title": "x", "rate": 1000.0, "uses_pressure": True}, "channels": list(NAMES)}
-    header |= {"metadata": {"scene": SCENE, "bench": BENCH, "process_started": "0"}, "units": ["V"], "started": "now"}
+    header |= {"metadata": {"scene": SCENE, "bench": BENCH, "writer": "{}"}, "units": ["V"], "started": "now"}
     match choices.below(4):
         case 1:
             header[choices.of(list(header))] = choices.of([None, 5, "x", [], {}, choices.number()])

@@ -54,7 +54,7 @@ def found_after(disk: Disk, moment: int, draw: random.Random, folder: Path) -> R
     folder.mkdir()
     disk.cut(moment, draw, folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rig.recovery._author_lives", lambda info, metadata: False)  # the tests' process is the author
+        patch.setattr("rig.recovery.lives", lambda writer: False)  # the tests' process is the writer
         try:
             return load_recording(folder / "run.h5")
         except FileError:
