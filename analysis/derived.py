@@ -10,8 +10,8 @@ from analysis.run import Run
 from model import jkr
 from model.parameters import Parameters
 
-EQUILIBRIUM_SEPARATION = 0.3e-9
-"""z_0 of the Tabor parameter for van der Waals contacts, m."""
+INTERFACE_STRENGTH = 100.8e3
+"""Stress over the contact at pull-off of the fibres in Table S3, Pa, where no area of the run's own is known."""
 
 LARGEST_RATIO_FOR_HALF_SPACE = 0.1
 """Contact radius over film thickness up to which a film on glass counts as a half-space."""
@@ -70,8 +70,8 @@ class Validity:
 
     Attributes
     ----------
-    tabor
-        Tabor parameter: JKR above 5, DMT below 0.1.
+    tabor, maugis
+        Tabor parameter, for the reach w / strength, and Maugis' lambda: JKR above 5, DMT below 0.1.
     confinement
         Contact radius over film thickness: a half-space below about 0.1.
     bounds
@@ -81,6 +81,7 @@ class Validity:
     """
 
     tabor: float
+    maugis: float
     confinement: float
     bounds: jkr.WorkOfAdhesionBounds
     remarks: tuple[str, ...]
@@ -91,8 +92,13 @@ class Validity:
         return not self.remarks
 
 
-def validity(force: float, radius: float, modulus: float, thickness: float, contact_radius: float | None) -> Validity:
+def validity(
+    force: float, radius: float, modulus: float, thickness: float, contact_radius: float | None, strength: float
+) -> Validity:
     """Check the assumptions behind S13.
+
+    JKR lets adhesion act at the edge of the contact alone. Fibres hold over a reach of w / strength, some of their own
+    height; van der Waals forces of bare surfaces over 0.3 nm.
 
     Parameters
     ----------
@@ -104,19 +110,26 @@ def validity(force: float, radius: float, modulus: float, thickness: float, cont
         Of the film on its rigid support, m.
     contact_radius
         At pull-off, m; ``None``: the one JKR gives.
+    strength
+        Stress that the interface carries, Pa.
     """
     work = jkr.work_of_adhesion_jkr(force, radius)
-    tabor = jkr.tabor_parameter(work, radius, modulus, EQUILIBRIUM_SEPARATION)
+    tabor = jkr.tabor_parameter(work, radius, modulus, work / strength)
+    maugis = jkr.maugis_parameter(work, radius, modulus, strength)
     contact = (3 * force * radius / (4 * modulus)) ** (1 / 3) if contact_radius is None else contact_radius
     confinement = contact / thickness
     remarks = []
     if tabor < 5:
         regime = "DMT" if tabor < 0.1 else "the transition between DMT and JKR"
-        remarks.append(f"Tabor parameter {tabor:.2g}: {regime}, not JKR")
+        excess = jkr.pull_off_force_maugis(work, radius, modulus, strength) / force - 1
+        remarks.append(
+            f"Tabor parameter {tabor:.2g}, Maugis' lambda {maugis:.2g}: {regime}, not JKR; adhesion that reaches "
+            f"{work / strength * 1e6:.2g} µm holds {excess:.0%} more force, so w is about as much too high"
+        )
     bounds = jkr.thin_layer_bounds(force, radius)
     if confinement > LARGEST_RATIO_FOR_HALF_SPACE:
         remarks.append(
             f"contact radius {confinement:.2g} times the film's thickness: no half-space; "
             f"thin-layer limits give {bounds.incompressible_layer:.2g} to {bounds.half_space:.2g} J/m²"
         )
-    return Validity(tabor, confinement, bounds, tuple(remarks))
+    return Validity(tabor, maugis, confinement, bounds, tuple(remarks))

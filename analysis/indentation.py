@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.derived import area_of, validity
+from analysis.derived import INTERFACE_STRENGTH, area_of, validity
 from analysis.errors import FeatureMissing
 from analysis.extraction import Details, Extraction, extraction_step
 from analysis.numerics import RECTANGULAR, Array, block_means
@@ -59,7 +59,10 @@ def indenter_radius(run: Run) -> float:
     },
 )
 def work_of_adhesion(work: Extraction) -> Details:
-    """Apply S13, and check it: Tabor parameter, and contact radius against the film's thickness."""
+    """Apply S13, and check it: reach of the adhesion (Tabor, Maugis), and contact radius against the film's thickness.
+
+    It reaches as far as w over the stress it carries: that over the contact's area of this run, or of Table S3.
+    """
     radius = indenter_radius(work.run)
     force = work.values["pull_off_force_N"]
     bounds = jkr.thin_layer_bounds(force, radius)
@@ -73,8 +76,10 @@ def work_of_adhesion(work: Extraction) -> Details:
     modulus = jkr.contact_modulus(membrane.youngs_modulus)
     area = projected_area(work.run)
     contact = None if area is None else math.sqrt(area / math.pi)
-    found = validity(force, radius, modulus, membrane.thickness, contact)
-    decision = "S13 holds" if found.holds else "S13 with reserve: " + "; ".join(found.remarks)
+    strength = INTERFACE_STRENGTH if area is None else force / area
+    found = validity(force, radius, modulus, membrane.thickness, contact, strength)
+    holds = f"S13 holds: Tabor parameter {found.tabor:.2g}, Maugis' lambda {found.maugis:.2g}"
+    decision = holds if found.holds else "S13 with reserve: " + "; ".join(found.remarks)
     return {"decision": decision, "validity": found}
 
 

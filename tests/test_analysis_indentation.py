@@ -180,12 +180,26 @@ def test_the_papers_quantities() -> None:
 
 
 def test_validity_by_tabor_and_confinement() -> None:
-    thick = validity(78e-3, 4e-3, 2.7e6, 0.1, 0.5e-3)
+    thick = validity(78e-3, 4e-3, 2.7e6, 0.1, 0.5e-3, 10e6)
     assert thick.holds
     assert thick.tabor > 5
-    film = validity(78e-3, 4e-3, 2.7e6, 250e-6, 0.5e-3)
+    film = validity(78e-3, 4e-3, 2.7e6, 250e-6, 0.5e-3, 10e6)
     assert not film.holds
     assert film.confinement == pytest.approx(2.0)
     assert film.bounds.half_space == pytest.approx(2 * film.bounds.incompressible_layer)
-    stiff = validity(1e-8, 1e-6, 70e9, 1.0, None)
+    stiff = validity(1e-8, 1e-6, 70e9, 1.0, None, 5e6)
     assert any("DMT" in remark for remark in stiff.remarks)
+
+
+def test_fibers_reach_too_far_for_jkr() -> None:
+    """4.1 J/m^2 at 100.8 kPa reach 41 um, not the 0.3 nm of bare surfaces: the transition between JKR and DMT."""
+    force = 1.5 * np.pi * 4.1 * RADIUS
+    found = validity(force, RADIUS, 8 / 3 * 1e6, 0.1, None, 100.8e3)
+    assert found.tabor == pytest.approx(0.52, abs=0.03)
+    assert found.maugis == pytest.approx(0.59, abs=0.04)
+    (remark,) = found.remarks
+    assert "transition" in remark
+    assert "13% more" in remark
+    words = analyze(indentation_run(), uncertainties=False).decisions["Work of adhesion (S13)"]
+    assert "Tabor" in words
+    assert "lambda" in words
