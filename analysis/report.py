@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 PDF_COLUMNS, PDF_LINES = 205, 70
 """Characters in a line of the PDF's tables, and lines on a page."""
 
+NO_BREAK = "\u00a0"
+"""Holds a number and its uncertainty on one line; between a mean and its deviation a cell may break."""
+
 EMULATED = "EMULATED: {which} from an emulated bench, not from an experiment: samples and instruments are computed."
 
 
@@ -117,7 +120,8 @@ def _pooled_cell(members: Group, name: str) -> str:
     mean = with_uncertainty(pooled.mean * factor, pooled.uncertainty * factor)
     remarks = [f"s = {pooled.deviation * factor:.2g}"] if pooled.count > 1 else []
     remarks += [f"n = {pooled.count}"] if pooled.count < len(members.kept) else []
-    return f"{mean} ({', '.join(remarks)})" if remarks else mean
+    parts = [mean, f"({', '.join(remarks)})"] if remarks else [mean]
+    return " ".join(part.replace(" ", NO_BREAK) for part in parts)
 
 
 def outlier_table(groups: Sequence[Group]) -> list[Table]:
@@ -145,7 +149,7 @@ def _largest_source(quantity: Quantity) -> str:
 
 
 STYLE = """
-body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;background:#fff;max-width:74rem;margin:2rem auto;padding:0
+body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;background:#fff;max-width:88rem;margin:2rem auto;padding:0
 1.2rem} h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.2rem;margin-top:2.4rem;border-bottom:1px solid #ccc}
 h3{font-size:1.08rem;margin:2rem 0 .4rem}h4{font-size:1rem;margin:1.4rem 0 .4rem}
 .warning{border-left:4px solid #D55E00;padding:.3rem .8rem;background:#fdf1ea;font-weight:600}
@@ -154,10 +158,11 @@ caption{text-align:left;font-weight:600;padding:.3rem 0}
 th,td{padding:.22rem .6rem;border-bottom:1px solid #e2e2e2;text-align:left;vertical-align:top}
 td{font-variant-numeric:tabular-nums;white-space:nowrap}details td:last-child{white-space:normal}
 thead th{border-bottom:2px solid #999;white-space:nowrap}
-tbody th{font-weight:500;white-space:nowrap}.note{font-size:.8rem;color:#555;margin:.1rem 0}
-img{max-width:100%;height:auto}.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(24rem,1fr));gap:1rem}
+tbody th{font-weight:500;white-space:nowrap}.results th,.results td{white-space:normal}
+.note{font-size:.8rem;color:#555;margin:.1rem 0}
+img{max-width:100%;height:auto}.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(34rem,100%),1fr));gap:1rem}
 code{font-size:.8rem;word-break:break-all}details{margin:.5rem 0}summary{cursor:pointer;color:#0072B2}
-@media print{details{display:block}}
+@media print{details{display:block}table{display:table;font-size:.7rem}}
 """
 
 
@@ -182,9 +187,10 @@ def _page(report: Report) -> Iterator[str]:
     if report.not_analysed:
         left = len(report.not_analysed)
         yield f'<p class="warning">{left} {_plural("file", left)} could not be analysed, see below.</p>'
-    yield "<h2>Results</h2>"
+    yield '<h2>Results</h2><div class="results">'
     for table in report.tables():
         yield table.html()
+    yield "</div>"
     figures = report.figures()
     if figures:
         yield '<h2>Figures</h2><div class="pair">'

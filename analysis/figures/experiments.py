@@ -23,7 +23,7 @@ from analysis.figures.parts import (
 )
 from analysis.figures.registry import Material, paper_figure
 from analysis.figures.run_overview import draw_against_time, force_axis, pressure_axis
-from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, MARKERS, ORANGE, PURPLE, plain
+from analysis.figures.style import BLACK, BLUE, CYCLE, GREEN, GREY, MARKERS, ORANGE, PURPLE, SKY, YELLOW, plain
 from analysis.indentation import fit_contact, indenter_radius
 from analysis.numerics import running_mean
 from analysis.pipeline import Analysis
@@ -368,6 +368,7 @@ def figure_s9(figure: Figure, material: Material) -> pd.DataFrame:
             series.add(f"{gripper} system", "model JKR", displacement_m=curve.indentation, force_N=curve.force)
         axes.set_xlabel("Vertical displacement z [mm], compression positive")
         axes.axhline(0, color=BLACK, linewidth=0.6)
+        axes.locator_params(axis="x", nbins=5)
     panels[0].set_ylabel(r"Reaction force $F_r$ [mN]")
     return series.frame()
 
@@ -377,7 +378,9 @@ def _draw_indentations(axes: Axes, analyses: Sequence[Analysis], series: Series)
     forces = np.array([analysis.features.value("pull_off_force_N") for analysis in analyses])
     middle = int(np.nanargmin(np.abs(forces - np.nanmean(forces)))) if np.isfinite(forces).any() else 0
     ends: list[tuple[float, float]] = []
-    for number, (analysis, color) in enumerate(zip(analyses, shades(len(analyses)), strict=True)):
+    few = (BLACK, BLUE, SKY, YELLOW, GREY)
+    colors = few[: len(analyses)] if len(analyses) <= len(few) else shades(len(analyses))
+    for number, (analysis, color) in enumerate(zip(analyses, colors, strict=True)):
         work = analysis.work
         origin = _origin(analysis)
         width = max(1, work.force.size // 4000)

@@ -80,7 +80,14 @@ def _contact(axes: Axes, analysis: Analysis) -> None:
     axes.set_xlim(-near, near)
     axes.set_xlabel("Separation from contact [µm]")
     axes.set_ylabel("Force [mN]")
-    axes.legend(fontsize=7, frameon=True, framealpha=1.0, edgecolor="none")
+    axes.legend(  # away from the zero force on this side, and mostly from the lines in the middle
+        loc="upper right" if sum(axes.get_ylim()) > 0 else "lower right",
+        fontsize=6.5,
+        handlelength=0.8,
+        frameon=True,
+        framealpha=1.0,
+        edgecolor="none",
+    )
 
 
 def _peak(axes: Axes, analysis: Analysis) -> None:

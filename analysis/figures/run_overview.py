@@ -126,7 +126,10 @@ def draw_against_time(axes: Axes, run: Run, analysis: Analysis) -> None:
     axes.margins(x=0.01, y=0.16)
     if run.pressure is not None:
         pressure = _smooth(run.pressure, run.rate) * 1e-3
-        pressure_axis(axes).plot(*thin(run.time, pressure), color=ORANGE, linewidth=1.0)
+        twin = pressure_axis(axes)
+        twin.plot(*thin(run.time, pressure), color=ORANGE, linewidth=1.0)
+        axes.set_zorder(twin.get_zorder() + 1)  # the numbers of the moments stand above the line of the pressure
+        axes.patch.set_visible(False)
     places = markers(run, analysis)
     for number, (index, name) in places.items():
         del name
