@@ -19,6 +19,7 @@ import tomlkit
 from pydantic import Field
 
 from rig.errors import FileError
+from rig.journal import journal_of
 from rig.library import find, load_scene
 from rig.scene import PRINTABLE, Scene, Title, parse_scene
 from rig.validation import Section, parsed
@@ -273,7 +274,7 @@ class Journal:
         """Return a name for the test's recording that nothing has yet."""
         for number in range(1, 10_000):
             path = self.folder / (f"{key}.h5" if number == 1 else f"{key}~{number}.h5")
-            if not path.exists():
+            if not path.exists() and not journal_of(path).exists():
                 return path
         raise FileError(f"{self.folder}: ten thousand recordings of {key}. Remedy: clear the folder.")
 

@@ -150,7 +150,8 @@ def _in_folder(found: Collection, folder: Path) -> list[Path]:
     """Return a folder's recordings by name; a campaign's journal says which are its own."""
     from rig.campaign import JOURNAL, Journal
 
-    files = sorted(path for path in folder.glob("*.h5") if path.is_file())
+    journals = (path.with_suffix("") for path in folder.glob("*.h5.journal") if path.is_file())
+    files = sorted({*journals, *(path for path in folder.glob("*.h5") if path.is_file())})
     if not (folder / JOURNAL).exists():
         return files
     entries = {folder / name for name in Journal(folder).done().values()}

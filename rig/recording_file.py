@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -10,12 +11,13 @@ from pathlib import Path
 import h5py
 
 from rig.errors import FileError
+from rig.journal import journal_of
 from rig.layout import FORMAT
 
 
 def insist(path: Path) -> None:
-    """Refuse a path where there is no file."""
-    if not path.is_file():
+    """Refuse a path where there is no file, nor the journal to write one anew from."""
+    if not path.is_file() and not journal_of(Path(os.path.realpath(path))).is_file():
         raise FileError(f"recording {path}: no such file. Remedy: check the path.")
 
 

@@ -48,10 +48,16 @@ def recover(path: Path, *, force: bool = False) -> Recovery:
         The program that writes it is still running, or may be (``force`` overrides).
     """
     insist(path)
+    path = Path(os.path.realpath(path))  # its journal lies beside the file, not beside a link to it
     if not is_sealed(path):
         rewritten = _rewritten(path, force=force)
         if rewritten is not None:
             return rewritten
+        if not path.is_file():
+            raise FileError(
+                f"recording {path}: only its journal is there, and holds nothing or is still being written. "
+                "Remedy: wait for the run to end; where its program has died elsewhere, wait a minute."
+            )
         try:
             probe(path)
         except FileError as error:

@@ -31,7 +31,9 @@ def seal(path: Path) -> None:
 
 
 def is_sealed(path: Path) -> bool:
-    """Whether the file is to the byte what the recorder closed."""
+    """Whether the file is there, and to the byte what the recorder closed."""
+    if not path.is_file():
+        return False
     content = path.read_bytes()
     mark, digest = content[-_LENGTH:-32], content[-32:]
     return mark == MARK and hashlib.sha256(content[:-_LENGTH]).digest() == digest

@@ -15,8 +15,10 @@ import pytest
 from held_run import held
 
 from rig import writer
+from rig.campaign import Journal
 from rig.cli import main
-from rig.errors import BeingWritten
+from rig.collection import Collection, _list_files
+from rig.errors import BeingWritten, FileError
 from rig.journal import journal_of
 from rig.library import find
 from rig.recording import load_recording
@@ -142,3 +144,43 @@ def test_another_process_is_not_the_writer(change: str) -> None:
 )
 def test_of_an_unknown_writer_nothing_is_known(odd: str | None) -> None:
     assert writer.lives(odd) is None
+
+
+@pytest.mark.parametrize("live", ["journalled"], indirect=True)
+def test_a_link_to_a_recording_leads_to_its_journal_too(live: Live, tmp_path: Path) -> None:
+    process, path = live
+    process.kill()
+    process.wait()
+    path.write_bytes(path.read_bytes()[:5000])  # a power cut
+    link = tmp_path / "folder" / "latest.h5"
+    link.parent.mkdir()
+    try:
+        link.symlink_to(path)
+    except OSError:
+        pytest.skip("links need a right on Windows")
+    assert load_recording(link).force.size == 201 * 20
+    assert link.is_symlink()
+    assert not journal_of(path).exists()
+
+
+@pytest.mark.parametrize("live", ["journalled"], indirect=True)
+def test_a_recording_of_which_only_the_journal_is_left_is_written_anew(live: Live, tmp_path: Path) -> None:
+    process, path = live
+    process.kill()
+    process.wait()
+    path.unlink()
+    assert Journal(tmp_path).free_name(path.stem) == tmp_path / "live~2.h5"
+    found = Collection()
+    _list_files(found, [tmp_path])
+    assert found.files == [path]
+    assert load_recording(path).force.size == 201 * 20
+
+
+def test_a_journal_that_holds_nothing_is_no_recording(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with pytest.raises(FileError, match="no such file"):
+        recover(path)
+    journal_of(path).write_bytes(b"")
+    with pytest.raises(FileError, match="only its journal"):
+        load_recording(path)
+    assert not path.exists()
