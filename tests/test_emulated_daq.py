@@ -299,6 +299,16 @@ LARGE = 1_000_000
 """Samples of a buffer that no reader on a busy computer is too late for."""
 
 
+def sawtooth(index: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A force of 1 mN per sample, within the range of the input however long the plant has been running."""
+    return index % 1000 * 1e-3
+
+
+def steps(volts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Samples the sawtooth has gone on by, from sample to sample."""
+    return (np.diff(volts) / 0.8e-3 + 500) % 1000 - 500
+
+
 def patient(server: EmulatedDaq, **options: float) -> NIDaq:
     """Return the driver as ``connect`` does; it does not mind a busy computer."""
     return connect(server, **{"buffer_seconds": LARGE / RATE, "patience": 60.0, **options})
@@ -320,13 +330,12 @@ def test_every_n_samples_the_client_is_called(world: SignalWorld) -> None:
             blocks.append(block)
             return 0
 
-        world.force = lambda index: index * 1e-3
+        world.force = sawtooth
         task.register_every_n_samples_acquired_into_buffer_event(50, arrived)
         task.start()
         eventually(lambda: len(blocks) >= 6)
         task.stop()
-        joined = np.concatenate(blocks, axis=1)[0]
-        assert np.abs(np.diff(joined) / 0.8e-3 - 1).max() < 8
+        assert np.abs(steps(np.concatenate(blocks, axis=1)[0]) - 1).max() < 8
         task.register_every_n_samples_acquired_into_buffer_event(50, None)
 
 
@@ -369,12 +378,11 @@ def test_in_real_time_the_plant_lives_though_nobody_reads(world: SignalWorld) ->
 
 
 def test_in_real_time_the_stream_is_contiguous_and_not_ahead_of_the_plant(world: SignalWorld) -> None:
-    world.force = lambda index: index * 1e-3
+    world.force = sawtooth
     with EmulatedDaq(world, speed=10.0) as server, patient(server) as daq:
         volts = np.concatenate([daq.read(50) for _ in range(40)], axis=1)
-        steps = np.diff(volts[0]) / 0.8e-3
-        assert np.abs(steps.mean() - 1) < 0.02
-        assert np.abs(steps - 1).max() < 8  # one step is 0.8 mV, noise 0.5 mV; a gap of one frame would be 50
+        assert np.abs(steps(volts[0]).mean() - 1) < 0.02
+        assert np.abs(steps(volts[0]) - 1).max() < 8  # one step is 0.8 mV, noise 0.5 mV; a gap of one frame would be 50
         assert world.sample >= 2000
 
 
