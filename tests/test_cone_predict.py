@@ -223,7 +223,7 @@ def test_a_cluster_gives_the_same_bits():
     distributed = pytest.importorskip("distributed")
     points = scenes(4200)
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="inproc://"
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0", protocol="inproc://"
     ) as cluster:
         shared = sweep(points, scheduler=cluster.scheduler_address)
     pd.testing.assert_frame_equal(sweep(points), shared, check_exact=True)

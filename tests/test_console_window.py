@@ -239,7 +239,7 @@ def test_the_emergency_stop_leaves_before_anything_is_painted(
 def test_a_stop_asked_for_just_before_the_window_closes_is_sent(
     console: Console, qtbot: QtBot, publish: Callable[..., Published], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    published = publish(speed=2.0)
+    published = publish(speed=UNHURRIED)
     attach(console, qtbot)
     assert console.link is not None
     command = console.link.command
@@ -259,7 +259,7 @@ def test_an_emergency_stop_is_waited_for_by_a_window_that_closes(
     console: Console, qtbot: QtBot, publish: Callable[..., Published], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run is killed if it does not answer: not even a closed window may call that off."""
-    publish(speed=2.0)
+    publish(speed=UNHURRIED)
     attach(console, qtbot)
     link = console.link
     assert link is not None
@@ -300,7 +300,7 @@ def test_the_emergency_stop_ends_a_run_that_is_between_two_tests(
 def test_a_stop_that_comes_as_the_run_hangs_up_ends_it_before_its_next_test(
     console: Console, qtbot: QtBot, publish: Callable[..., Published], between: Child, key: Qt.Key
 ) -> None:
-    published = publish(speed=2.0)
+    published = publish(speed=UNHURRIED)
     attach(console, qtbot)
     console._timer.stop()  # the window has not yet seen it
     published.close()

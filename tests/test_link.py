@@ -453,7 +453,7 @@ def test_two_emergency_stops_at_once_are_both_acknowledged(monkeypatch: pytest.M
         for thread in waiting:
             thread.start()
         for thread in waiting:
-            thread.join(20)
+            thread.join(200)
         assert [answer.done for answer in answers] == [True, True]
         assert pressed == ["now", "now"]
         link.close()

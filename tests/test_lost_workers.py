@@ -43,7 +43,7 @@ def test_an_item_that_kills_every_process_is_named_and_the_others_are_computed(t
 
 
 def test_who_stops_asking_does_not_wait_for_the_rest(tmp_path: Path) -> None:
-    outcomes = on_all_cores(partial(square, tmp_path, {19: 1}), NUMBERS, workers=2)
+    outcomes = on_all_cores(partial(square, tmp_path, {19: 1}, seconds=0.5), NUMBERS, workers=2)
     assert next(outcomes) == 0
     outcomes.close()
     assert not list(tmp_path.iterdir())
@@ -54,7 +54,7 @@ def test_a_cluster_computes_again_what_a_killed_worker_was_at(tmp_path: Path) ->
     work = partial(square, tmp_path, {3: 1, 5: 99})
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 1}),
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster,
     ):
         outcomes = list(on_all_cores(work, NUMBERS, scheduler=cluster.scheduler_address, lost=name_it))
     assert outcomes == [-number if number == 5 else number**2 for number in NUMBERS]

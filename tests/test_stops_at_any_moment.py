@@ -29,7 +29,7 @@ from rig.recorder import Recorder
 from rig.recording import load_recording
 from rig.session import run_scene
 
-PATIENCE_S = 20.0
+PATIENCE_S = 200.0
 
 
 def interrupted(action: Callable[[], Any], handler: Callable[[], Any], line: int, *files: str) -> bool:
@@ -92,7 +92,7 @@ def test_a_stop_between_any_two_lines_of_the_controls_is_kept(asked: str) -> Non
 def test_an_emergency_stop_between_any_two_lines_of_the_driver_is_sent(asked: str) -> None:
     controller = EmulatedController(MotionWorld(), referenced=True)
     with serve_tcp(controller) as server:
-        stage = PIStage(server.url, reply_timeout=5.0)
+        stage = PIStage(server.url, reply_timeout=60.0)
         arguments = (stage.status().position,) if asked == "move_to" else ()
         line = 0
         within = True
@@ -241,7 +241,7 @@ def test_a_failure_in_a_campaign_on_several_processes_begins_no_further_test(
     def fake(test: Any, *_: Any) -> tuple[str, int, str, bool]:
         begun.append(test.key)
         if len(begun) > 1:
-            time.sleep(0.3)
+            time.sleep(1.5)
         return f"{test.key}.h5", 4, "broken", False
 
     monkeypatch.setattr(futures, "ProcessPoolExecutor", Pool)
@@ -250,7 +250,7 @@ def test_a_failure_in_a_campaign_on_several_processes_begins_no_further_test(
     assert len(begun) < 10
 
 
-@pytest.mark.timeout(30)
+@pytest.mark.timeout(300)
 def test_ctrl_c_ends_the_emulator_whatever_it_is_doing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The handler runs while the waiting thread holds whatever it waits with."""
     wait, sleep = threading.Condition.wait, time.sleep
