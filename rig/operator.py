@@ -11,7 +11,7 @@ from typing import TextIO
 
 from rig.errors import Refused
 from rig.observe import Controls, Event, Observer
-from rig.voice import Voice
+from rig.voice import Voice, say
 
 
 class Keyboard:
@@ -78,7 +78,7 @@ class Keyboard:
             for _ in self._stream:
                 self._pressed()
         except (OSError, ValueError) as error:  # the terminal is gone
-            print(f"rig: the keyboard cannot be read any more ({error})", file=sys.stderr)
+            say(f"rig: the keyboard cannot be read any more ({error})")
         self._closed = True
         self._give_up()
 
@@ -109,7 +109,8 @@ class Prompts(Observer):
         nobody = (
             "nobody can answer, standard input is closed: the run ends. Remedy: run it in a terminal, or with --link"
         )
-        self._voice.say(f"            {', or '.join(ways) or nobody}\n")
+        with contextlib.suppress(OSError, ValueError):  # a terminal that shows nothing any more may still take answers
+            self._voice.say(f"            {', or '.join(ways) or nobody}\n")
 
 
 if sys.platform == "win32":

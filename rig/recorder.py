@@ -169,8 +169,18 @@ class Recorder:
         except OSError as error:
             path.unlink()
             raise _not_created(path, error) from error
-        self._held = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-        self._file = h5py.File(path, "r+", libver="latest")
+        try:
+            self._held = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+            try:
+                self._file = h5py.File(path, "r+", libver="latest")
+            except OSError:  # a file system without locks, say
+                os.close(self._held)
+                raise
+        except OSError as error:
+            if self._journal is not None:
+                self._journal.close(keep=False)
+            path.unlink()
+            raise _not_created(path, error) from error
         self._sets = {name: self._file[place] for name, place in places.items()}
         self._file.swmr_mode = True
 

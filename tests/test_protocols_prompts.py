@@ -7,6 +7,7 @@ import os
 import queue
 import select
 import time
+from unittest import mock
 
 import pytest
 from conftest import scene_text
@@ -119,6 +120,16 @@ def test_without_standard_input_nobody_can_answer(monkeypatch):
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(Refused, match="Nobody can answer"):
         Keyboard().confirm("Mount the sphere.")
+
+
+def test_a_prompt_is_answered_where_its_words_reach_nobody(line):
+    keyboard, press = line
+    controls = Controls()
+    gone = mock.Mock(say=mock.Mock(side_effect=BrokenPipeError))
+    Prompts(keyboard, controls, gone).event(PROMPT)
+    press.write("\n")
+    assert taken(controls) is Wish.RESUME
+    press.close()
 
 
 def test_a_closed_keyboard_refuses_and_names_the_console(capsys, monkeypatch):

@@ -176,6 +176,23 @@ def test_a_run_ends_before_its_file_is_as_large_as_it_may_be(tmp_path):
         assert file["entry/ending"][0]["exit_code"] == 2
 
 
+@pytest.mark.parametrize("journalled", [False, True])
+def test_a_file_system_without_locks_is_refused_and_nothing_is_left(request_for, tmp_path, journalled):
+    request = request_for()
+    recording = request.bench.recording.model_copy(update={"survives_power_cut": journalled})
+    request.bench = request.bench.model_copy(update={"recording": recording})
+    opened = h5py.File
+
+    def file(name, mode, **options):
+        if mode == "r+":
+            raise OSError(37, "No locks available")
+        return opened(name, mode, **options)
+
+    with patch("rig.recorder.h5py.File", file), pytest.raises(FileError, match=r"cannot be created .*No locks"):
+        run_scene(request)
+    assert not list(tmp_path.iterdir())
+
+
 class _Once(Observer):
     """Does something once, some frames into the run."""
 
