@@ -110,6 +110,17 @@ def test_a_replay_with_a_value_that_is_none_of_the_scene_is_refused(change, requ
     assert change in told
 
 
+def test_a_system_without_room_for_the_live_prediction_costs_no_test(request_for, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("rig.live_run.live", refuse)
+    request = request_for("sphere-60mm-low", live=True)
+    assert run_scene(request).exit_code == 0
+    told = [row["text"] for row in load_recording(request.out).events if row["kind"] == b"warning"]
+    assert any(b"no live prediction" in text for text in told)
+
+
 class StopIn(Observer):
     """Asks for something when a step begins."""
 
