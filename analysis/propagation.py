@@ -134,8 +134,9 @@ def _drift_excess(work: Extraction) -> float:
 
     Waves about as long as the gap between the force-free parts are hidden best. Those that pass through the parts with
     the slopes v (rms, against the line) that a cubic finds there are as high as v / omega = v gap / 2 pi times the
-    square root of two, and that is their rms departure from the line. A quarter of the drift from the first part to
-    the last is added for what bends without showing at the ends.
+    square root of two, and that is their rms departure from the line. The slopes' own noise, which every copy with
+    noise of its own already shows, is taken off. A quarter of the drift from the first part to the last is added for
+    what bends without showing at the ends.
     """
     windows = work.details["tare"]["windows"]
     assert isinstance(windows, list)
@@ -143,9 +144,20 @@ def _drift_excess(work: Extraction) -> float:
         return abs(float(work.baseline.deriv()(0.0))) * (work.windows.end - work.contact_start) / 2
     (first, left), (right, last) = windows
     slope = fit_baseline(work.force, windows, degree=3).deriv()
-    seen = float(np.sqrt(np.mean(slope(np.array([first + left, right + last]) / 2) ** 2)))
+    slopes = slope(np.array([first + left, right + last]) / 2)
+    noise = [_slope_noise(work.noise, length) for length in (left - first, last - right)]
+    seen = np.sqrt(max(0.0, float(np.mean(slopes**2) - np.mean(np.square(noise)))))
     drift = float(work.baseline(right) - work.baseline(left))
     return float(np.hypot(seen * (right - left) / (np.sqrt(2) * np.pi), 0.25 * drift))
+
+
+def _slope_noise(noise: Noise, length: int) -> float:
+    """Standard deviation of the slope of a line fitted to so many samples, N per sample.
+
+    The difference of the means of both halves has the variance 16 s^2 / n^3 for white noise s, the fit three quarters.
+    """
+    half = max(1, length // 2)
+    return float(np.sqrt(0.75 * 2) * noise.of_mean(half) / half)
 
 
 def _bump(work: Extraction, height: float) -> Array:

@@ -11,6 +11,7 @@ import pytest
 from analysis import analyze
 from analysis.coverage import CASES, coverage, deviations
 from analysis.extraction import extract
+from analysis.numerics import Noise
 from analysis.preparation import fit_baseline
 from analysis.propagation import _drift_excess
 
@@ -89,23 +90,45 @@ def test_a_fit_is_no_better_known_than_the_force_it_was_fitted_to() -> None:
         assert fitted.budget[source] == pytest.approx(force.budget[source], rel=0.6), source
 
 
-@pytest.mark.parametrize("gap", [40, 160, 300])
-def test_a_wander_as_slow_as_the_contact_is_long_is_covered(gap: int) -> None:
-    """The zero of force wanders between two short force-free parts, in waves of 200 to 1800 s."""
-    generator, rate, scores = np.random.default_rng(1), 50, []
+def drift_scores(gap: int, wander: float) -> tuple[list[float], list[float]]:
+    """Return errors of the zero in units of the drift stated, and the drift stated in units of the noise, N/N.
+
+    The zero of force wanders between two short force-free parts, in waves of 200 to 1800 s.
+    """
+    generator, rate, sigma = np.random.default_rng(1), 50, 6e-5
+    scores, stated = [], []
     for _ in range(100):
         before, after = (round(rate * generator.uniform(5, 10)) for _ in range(2))
         count = before + gap * rate + after
         time = np.arange(count) / rate
-        zero = 4e-6 * generator.normal() * time
+        zero = wander * 1e-2 * generator.normal() * time
         for period in (197.0, 611.0, 1789.0):
             phase = generator.uniform(0, 2 * np.pi)
-            zero = zero + 4e-4 * generator.normal() * np.sin(2 * np.pi * time / period + phase)
+            zero = zero + wander * generator.normal() * np.sin(2 * np.pi * time / period + phase)
         windows = [(0, before), (count - after, count)]
-        recorded = zero + generator.normal(0, 6e-5, count)
+        noise = Noise(sigma, generator.normal(0, sigma, count))
+        recorded = zero + noise.residual
         baseline = fit_baseline(recorded, windows)
         line = baseline(np.arange(count))
-        work = SimpleNamespace(details={"tare": {"windows": windows}}, force=recorded - line, baseline=baseline)
-        inside = generator.integers(before, count - after, 8)
-        scores += list((zero - line)[inside] / _drift_excess(work))  # type: ignore[arg-type]
+        work = SimpleNamespace(
+            details={"tare": {"windows": windows}}, force=recorded - line, baseline=baseline, noise=noise
+        )
+        excess = _drift_excess(work)  # type: ignore[arg-type]
+        scores += list((zero - line)[generator.integers(before, count - after, 8)] / excess)
+        stated.append(excess / sigma)
+    return scores, stated
+
+
+@pytest.mark.parametrize("gap", [40, 160, 300])
+def test_a_wander_as_slow_as_the_contact_is_long_is_covered(gap: int) -> None:
+    scores, _ = drift_scores(gap, wander=4e-4)
     assert 0.4 < np.sqrt(np.mean(np.square(scores))) < 1.2
+
+
+@pytest.mark.parametrize("gap", [40, 160, 300])
+def test_noise_in_the_force_free_parts_is_no_drift(gap: int) -> None:
+    """The slope of a line through n samples has the noise s sqrt(12 / n^3): over the gap that would be 1 to 7 s."""
+    _, stated = drift_scores(gap, wander=0.0)
+    samples = 7.5 * 50
+    as_drift = np.sqrt(12 / samples**3) * gap * 50 / (np.sqrt(2) * np.pi)
+    assert np.median(stated) < 0.6 * as_drift
