@@ -257,7 +257,8 @@ def test_tables_tell_what_they_left_out_and_what_they_do_not_know(
     made: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("analysis.repeats._outliers", lambda members: {"second": "F_p = far off"})
-    code, out, _ = analyze(capsys, made / "first.h5", made / "second.h5", "--tables")
+    code, out, error = analyze(capsys, made / "first.h5", made / "second.h5", "--tables")
+    assert "EMULATED, no experiment: first, second" in error
     assert code == 0
     assert "| second |" in out
     assert "far off" in out

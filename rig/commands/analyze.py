@@ -181,6 +181,9 @@ def _print(arguments: argparse.Namespace, found: Collection) -> None:
     from analysis.repeats import group
 
     analyses = [analyzed.analysis for analyzed in found.runs]
+    emulated = [a.analysis.run.name for a in found.runs if a.source is not None and a.source.metadata.get("emulated")]
+    if emulated and (arguments.csv or arguments.tables or arguments.curves):  # these have no room for it
+        print(f"rig analyze: EMULATED, no experiment: {', '.join(emulated)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(as_json(found), ensure_ascii=False))
     elif arguments.csv and analyses:
