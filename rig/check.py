@@ -258,17 +258,15 @@ def _overruns(scene: Scene, bench: Bench) -> list[str]:
             "run the scene `compliance` and enter its result"
         ]
     limits, preload = bench.limits, protocol.preload_N + pressing_at_rest(bench)
-    reaction = reaction_s(bench)
-    key = (
-        "compression_N" if limits.compression_N >= limits.tension_N else "tension_N"
-    )  # compression_positive may be wrong
+    # compression_positive may be wrong: the larger limit may be the one that stops the approach
+    key = max("compression_N", "tension_N", key=lambda name: float(getattr(limits, name)))
     found = _too_fast(
         "approach_speed_um_s",
         protocol.approach_speed_um_s,
         bench,
         {
-            f"lower {key} or shorten frame_ms": room_um(bench, getattr(limits, key)) / reaction,
-            "lower preload_N or shorten lag_s": room_um(bench, preload) / (reaction + limits.lag_s),
+            f"lower {key} or shorten frame_ms": return_speed(bench) * 1e6,
+            "lower preload_N or shorten lag_s": room_um(bench, preload) / (reaction_s(bench) + limits.lag_s),
         },
     )
     furthest = room_um(bench, preload)

@@ -63,3 +63,21 @@ def request_for(tmp_path: Path) -> Callable[..., Request]:
         return dataclasses.replace(request, **options)
 
     return make
+
+
+@pytest.fixture
+def tell_bench(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any], None]], None]:
+    """Return a function that takes who is to be told the emulated bench of every run."""
+    from rig import emulation
+
+    def tell(to: Callable[[Any], None]) -> None:
+        make = emulation.emulated_bench
+
+        def made(request: Request) -> Any:
+            bench = make(request)
+            to(bench)
+            return bench
+
+        monkeypatch.setattr(emulation, "emulated_bench", made)
+
+    return tell

@@ -31,14 +31,9 @@ class Truth(Observer):
 
 
 @pytest.fixture
-def truth(monkeypatch):
-    seen, make = Truth(), emulation.emulated_bench
-
-    def made(request):
-        seen.world = make(request)
-        return seen.world
-
-    monkeypatch.setattr(emulation, "emulated_bench", made)
+def truth(tell_bench):
+    seen = Truth()
+    tell_bench(lambda bench: setattr(seen, "world", bench))
     return seen
 
 

@@ -51,17 +51,10 @@ class Witness(Observer):
 
 
 @pytest.fixture
-def witness(monkeypatch):
+def witness(tell_bench):
     """Return a witness that is given the emulated bench of the next run."""
-    from rig import emulation
-
-    seen, make = Witness(), emulation.emulated_bench
-
-    def made(request):
-        seen.bench = make(request)
-        return seen.bench
-
-    monkeypatch.setattr(emulation, "emulated_bench", made)
+    seen = Witness()
+    tell_bench(lambda bench: setattr(seen, "bench", bench))
     return seen
 
 
